@@ -1,0 +1,142 @@
+"""Where pixels are: a grid is one immutable value, blocks cover each pixel once."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+from rasterio.crs import CRS
+from rasterio.warp import transform as transform_points
+from rasterio.windows import Window
+from rasterio.windows import transform as window_transform
+
+from tscorr.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A rectangle of pixels: first row, first column, and how many of each."""
+
+    row: int
+    col: int
+    height: int
+    width: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols)."""
+        return self.height, self.width
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the block in an array of the whole grid."""
+        return slice(self.row, self.row + self.height), slice(self.col, self.col + self.width)
+
+    @property
+    def window(self) -> Window:
+        """The same rectangle as rasterio reads and writes it."""
+        return Window(self.col, self.row, self.width, self.height)
+
+    def padded(self, margin: int) -> "Block":
+        """The block with `margin` pixels more on every side; may reach beyond the grid."""
+        return Block(self.row - margin, self.col - margin, self.height + 2 * margin, self.width + 2 * margin)
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """CRS, transform and shape (rows, cols) of a raster; `transform` maps corners (col, row) to (x, y)."""
+
+    crs: CRS | None
+    transform: Affine
+    shape: tuple[int, int]
+
+    @property
+    def cell_size(self) -> tuple[float, float]:
+        """Length of a pixel's side along a row and along a column. [units of the CRS]"""
+        t = self.transform
+        return float(np.hypot(t.a, t.d)), float(np.hypot(t.b, t.e))
+
+    @property
+    def is_north_up(self) -> bool:
+        """Whether rows run west to east and columns north to south."""
+        t = self.transform
+        return t.b == 0 and t.d == 0 and t.a > 0 and t.e < 0
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Map coordinates of the middle of the grid."""
+        x, y = self.xy((self.shape[0] - 1) / 2, (self.shape[1] - 1) / 2)
+        return float(x), float(y)
+
+    def xy(self, row: Any, col: Any) -> tuple[Any, Any]:
+        """Map coordinates of the centres of pixels (row, col); fractions and arrays are welcome."""
+        t = self.transform
+        c, r = np.asarray(col, dtype=float) + 0.5, np.asarray(row, dtype=float) + 0.5
+        return t.a * c + t.b * r + t.c, t.d * c + t.e * r + t.f
+
+    def rowcol(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Fractional (row, col) of map coordinates; the centre of pixel (0, 0) is (0.0, 0.0)."""
+        inverse = ~self.transform
+        x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+        col = inverse.a * x + inverse.b * y + inverse.c - 0.5
+        row = inverse.d * x + inverse.e * y + inverse.f - 0.5
+        return row, col
+
+    def corners(self) -> tuple[Array, Array]:
+        """Map coordinates of the four outer corners, in the order of a ring."""
+        rows, cols = self.shape
+        return self.xy(np.array([0, 0, rows, rows]) - 0.5, np.array([0, cols, cols, 0]) - 0.5)
+
+    def crop(self, block: Block) -> "Grid":
+        """The grid of one block of this grid; the block may reach beyond it."""
+        return Grid(self.crs, window_transform(block.window, self.transform), block.shape)
+
+
+def blocks(shape: tuple[int, int], block_shape: tuple[int, int]) -> Iterator[Block]:
+    """Blocks in row order that cover each pixel of `shape` (rows, cols) exactly once."""
+    rows, cols = shape
+    height, width = block_shape
+    for row in range(0, rows, height):
+        for col in range(0, cols, width):
+            yield Block(row, col, min(height, rows - row), min(width, cols - col))
+
+
+def longitude_latitude(grid: Grid, x: Any, y: Any) -> tuple[Array, Array]:
+    """Longitude and latitude on WGS 84 of map coordinates. [deg]"""
+    return reproject(require_crs(grid), CRS.from_epsg(4326), x, y)
+
+
+def reproject(source: CRS, target: CRS, x: Any, y: Any) -> tuple[Array, Array]:
+    """Map coordinates `x`, `y` (any equal shapes) of one CRS in another; x is always east or longitude."""
+    x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
+    if source == target:
+        return x.copy(), y.copy()
+    new_x, new_y = transform_points(source, target, x.ravel(), y.ravel())
+    return np.reshape(new_x, x.shape), np.reshape(new_y, y.shape)
+
+
+def convergence_deg(grid: Grid, x: float, y: float) -> float:
+    """Meridian convergence of the grid at a point. [deg]
+
+    Positive where grid north lies east of true north, so that
+    grid azimuth = true azimuth - convergence. From two points 100 m apart on the meridian.
+    """
+    crs = require_crs(grid)
+    longitude, latitude = longitude_latitude(grid, x, y)
+    half_step = 0.00045  # degrees of latitude: 50 m
+    north = np.array([latitude - half_step, latitude + half_step])
+    xs, ys = reproject(CRS.from_epsg(4326), crs, np.full(2, longitude), north)
+    if not np.all(np.isfinite([xs, ys])):
+        raise InputError(f"the CRS {crs.to_string()} has no meridian at x = {x:.1f}, y = {y:.1f}")
+    return float(-np.rad2deg(np.arctan2(xs[1] - xs[0], ys[1] - ys[0])))
+
+
+def require_crs(grid: Grid) -> CRS:
+    """The CRS of a grid, or an error that says what it is needed for."""
+    if grid.crs is None:
+        raise InputError("the image has no CRS: place and true north are unknown")
+    return grid.crs
