@@ -1,0 +1,135 @@
+"""The functions for notebooks: arrays in, arrays out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tscorr import reference
+from tscorr.correction import BlockInputs, Corrector, Rules, Stored, class_rows
+from tscorr.errors import InputError
+from tscorr.materials import Material, material
+
+Array = NDArray[Any]
+
+
+def brdf(
+    surface: Material | str,
+    incidence_deg: ArrayLike,
+    exitance_deg: ArrayLike,
+    relative_azimuth_deg: ArrayLike,
+    form: Literal["full", "simplified"] = "full",
+    wavelength_um: float | None = None,
+) -> Array:
+    """Bidirectional reflectance distribution function f_r of a material; equation 1 of the paper. [sr^-1]
+
+    surface : a `Material`, or the name of one of the built-in library.
+    incidence_deg, exitance_deg : from the surface normal, 0 to below 90; nan beyond. Arrays broadcast.
+    relative_azimuth_deg : 0 is back-scatter, 180 forward scatter.
+    wavelength_um : needed where the material has several wavelengths.
+
+    >>> float(round(brdf("roof_tile", 50, 50, 180)[()], 6))
+    0.075590
+    """
+    known = material(surface) if isinstance(surface, str) else surface
+    parameters = known.at(None if wavelength_um is None else [wavelength_um])
+    angles = [np.asarray(angle, dtype=float) for angle in (incidence_deg, exitance_deg, relative_azimuth_deg)]
+    geometry = reference.geometry_from_angles(*np.broadcast_arrays(*angles))
+    t0, t1, w, n, k = (getattr(parameters, name)[0] for name in ("t0", "t1", "w", "n", "k"))
+    f_spec = reference.specular(geometry, w, n, k, simplified=form == "simplified")
+    return reference.brdf(f_spec, t0, t1)
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionResult:
+    """What `correct` returns.
+
+    corrected, removed : (bands, rows, cols), of the type of the input; input - removed = corrected.
+    flags : uint16 (rows, cols), bits of `PixelFlag`.
+    """
+
+    corrected: Array
+    removed: Array
+    flags: Array
+
+
+def correct(
+    reflectance_factor: ArrayLike,
+    classes: ArrayLike,
+    materials: Mapping[int, Material | str],
+    sun: ArrayLike,
+    view: ArrayLike,
+    normal: ArrayLike | None = None,
+    *,
+    shadowed: ArrayLike | None = None,
+    hidden: ArrayLike | None = None,
+    wavelength_um: Sequence[float] | None = None,
+    scale: float = 1.0,
+    offset: float = 0.0,
+    nodata: float | None = None,
+    saturation: float | None = None,
+    rules: Rules | None = None,
+    skip: bool = True,
+) -> CorrectionResult:
+    """An image without its specular part.
+
+    reflectance_factor : (bands, rows, cols) or (rows, cols), of which scale * value + offset is taken;
+                         uint8, int16, uint16 or float32, other floats are taken as float32.
+    classes   : integers (rows, cols).
+    materials : material, or name of a built-in one, for each class; pixels of other classes are left alone.
+    sun, view, normal : unit vectors east, north, up: (3,) or (3, rows, cols); normal is up by default.
+    shadowed, hidden  : bool (rows, cols), where something stands before the sun or before the sensor.
+    rules     : how to correct; by default R refers to the horizontal plane and all light is direct.
+    Raises InputError where shapes or types do not fit. The input is not changed.
+    """
+    image = np.asarray(reflectance_factor)
+    if image.dtype.name not in {"uint8", "int16", "uint16", "float32"}:
+        if image.dtype.kind != "f":
+            raise InputError(f"an image of {image.dtype}; allowed are uint8, int16, uint16 and floating point")
+        image = image.astype(np.float32)
+    cube = np.array(image[None] if image.ndim == 2 else image, order="C")
+    class_map = np.asarray(classes)
+    if cube.ndim != 3 or class_map.shape != cube.shape[1:]:
+        raise InputError(f"an image of shape {image.shape} and classes of shape {class_map.shape} do not fit")
+    bands, shape = cube.shape[0], cube.shape[1:]
+    settings = rules or Rules()
+    entries = []
+    for entry in materials.values():
+        surface = material(entry) if isinstance(entry, str) else entry
+        entries.append((surface, surface.at(wavelength_um, bands), settings))
+    stored = Stored(
+        dtype=cube.dtype,
+        scale=(scale,) * bands,
+        offset=(offset,) * bands,
+        nodata=nodata,
+        saturation=None if saturation is None else (saturation,) * bands,
+    )
+    rows = {value: row for row, value in enumerate(materials, start=1)}
+    inputs = BlockInputs(
+        image=cube,
+        material=class_rows(class_map, rows),
+        sun=_vectors("sun", sun, shape),
+        view=_vectors("view", view, shape),
+        normal=_vectors("normal", [0, 0, 1] if normal is None else normal, shape),
+        shadowed=None if shadowed is None else np.broadcast_to(np.asarray(shadowed, dtype=bool), shape),
+        hidden=None if hidden is None else np.broadcast_to(np.asarray(hidden, dtype=bool), shape),
+    )
+    result = Corrector(entries, stored, skip=skip)(inputs)
+    assert result.removed is not None
+    if image.ndim == 2:
+        return CorrectionResult(result.corrected[0], result.removed[0], result.flags)
+    return CorrectionResult(result.corrected, result.removed, result.flags)
+
+
+def _vectors(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    vectors = np.asarray(values, dtype=float)
+    if vectors.shape not in {(3,), (3, *shape)}:
+        raise InputError(f"{name} has the shape {vectors.shape}; allowed are (3,) and {(3, *shape)}")
+    length = np.sqrt((vectors**2).sum(axis=0))
+    if np.any(np.abs(length - 1) > 1e-3):
+        raise InputError(
+            f"{name} holds vectors of length {length.flat[np.abs(length - 1).argmax()]:.4g}; allowed is 1"
+        )
+    return vectors.reshape(3, 1, 1) if vectors.ndim == 1 else vectors

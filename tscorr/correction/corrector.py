@@ -1,0 +1,177 @@
+"""A block in, a block without its specular part out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tscorr import kernels, reference
+from tscorr.correction.flags import PixelFlag
+from tscorr.correction.rules import Stored
+from tscorr.correction.tables import Entry, material_table, new_tally, pixel_rules
+from tscorr.errors import InputError
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BlockInputs:
+    """One block of a scene.
+
+    image    : (bands, rows, cols), stored values; corrected in place.
+    material : uint8 (rows, cols), the material's place in the `Corrector`, from 1; 0 is none.
+    sun, view, normal : unit vectors (3, rows, cols), or (3, 1, 1) where constant; east, north, up.
+    shadowed, hidden, unreliable, low_confidence : bool (rows, cols), or None where nowhere true.
+    """
+
+    image: Array
+    material: Array
+    sun: Array
+    view: Array
+    normal: Array
+    shadowed: Array | None = None
+    hidden: Array | None = None
+    unreliable: Array | None = None
+    low_confidence: Array | None = None
+
+    def flags(self) -> Array:
+        """The bits that are known before the correction: uint16 (rows, cols)."""
+        flags = np.zeros(self.material.shape, np.uint16)
+        for mask, flag in (
+            (self.shadowed, PixelFlag.CAST_SHADOW),
+            (self.hidden, PixelFlag.NOT_VIEWED),
+            (self.unreliable, PixelFlag.NORMAL_UNRELIABLE),
+            (self.low_confidence, PixelFlag.LOW_CONFIDENCE),
+        ):
+            if mask is not None:
+                flags |= mask * np.uint16(flag)
+        return flags
+
+
+@dataclass(frozen=True, slots=True)
+class BlockResult:
+    """A corrected block: the image that came in, what was removed (or None), flags and sums for the report."""
+
+    corrected: Array
+    removed: Array | None
+    flags: Array
+    tally: kernels.Tally
+
+
+@dataclass(frozen=True, slots=True)
+class _Engine:
+    """The materials of one precision."""
+
+    precision: str
+    table: kernels.MaterialTable
+    mine: Array
+    """bool (materials,): which rows of the table are its own"""
+
+
+class Corrector:
+    """Corrects the blocks of one scene: materials in order, their rules, and the meaning of stored values.
+
+    materials : name, parameters for each band, allowed angles; row i + 1 of the tables.
+    """
+
+    def __init__(
+        self,
+        materials: Sequence[Entry],
+        stored: Stored,
+        *,
+        skip: bool = True,
+        tally_stride: int = 1,
+    ) -> None:
+        if len(materials) > 254:
+            raise InputError(f"a scene has {len(materials)} materials; allowed are 254")
+        self.names = tuple(entry[0].name for entry in materials)
+        self.stored = stored
+        self.skip = skip
+        self.tally_stride = tally_stride
+        self._pixels = pixel_rules(stored)
+        precisions = [rules.precision for *_, rules in materials]
+        self._engines = [
+            self._engine(precision, materials, stored) for precision in sorted(set(precisions)) or ["fast"]
+        ]
+
+    @staticmethod
+    def _engine(precision: str, materials: Sequence[Entry], stored: Stored) -> _Engine:
+        mine = np.array([False, *(rules.precision == precision for *_, rules in materials)])
+        real = np.float32 if precision == "fast" else np.float64
+        table = material_table(materials, len(stored.scale), real)
+        return _Engine(precision, table._replace(peak=table.peak & mine), mine)
+
+    @property
+    def peaks(self) -> Array:
+        """Which rows have a lobe to remove: bool (materials + 1,); row 0, no material, has none."""
+        return np.logical_or.reduce([engine.table.peak for engine in self._engines])
+
+    def __call__(self, inputs: BlockInputs, *, first_row: int = 0, want_removed: bool = True) -> BlockResult:
+        """The block without its specular part; `inputs.image` is changed in place."""
+        bands, *shape = inputs.image.shape
+        removed = np.zeros((bands, *shape) if want_removed else (bands, 0, 0), inputs.image.dtype)
+        tally = new_tally(len(self.names) + 1, bands)
+        flags = inputs.flags()
+        if len(self._engines) == 1:
+            self._run(self._engines[0], inputs, removed, flags, tally, first_row)
+        else:
+            self._run_each(inputs, removed, flags, tally, first_row)
+        return BlockResult(inputs.image, removed if want_removed else None, flags, tally)
+
+    def _run_each(
+        self, inputs: BlockInputs, removed: Array, flags: Array, tally: kernels.Tally, first_row: int
+    ) -> None:
+        """Several precisions: each engine sees the others' pixels as if they had no material."""
+        known = flags.copy()
+        for engine in self._engines:
+            mine = engine.mine[inputs.material]
+            own = replace(inputs, material=np.where(mine, inputs.material, np.uint8(0)))
+            own_flags = known.copy()
+            self._run(engine, own, removed, own_flags, tally, first_row)
+            take = mine | (inputs.material == 0)
+            flags[take] = own_flags[take]
+        tally.states[0] = 0, 0, 0, np.count_nonzero(inputs.material == 0)
+
+    def _run(
+        self,
+        engine: _Engine,
+        inputs: BlockInputs,
+        removed: Array,
+        flags: Array,
+        tally: kernels.Tally,
+        first_row: int,
+    ) -> None:
+        real = np.float32 if engine.precision == "fast" else np.float64
+        correct_block = reference.correct_block if engine.precision == "reference" else kernels.correct_block
+        options = np.array([engine.precision == "exact", self.skip, first_row, self.tally_stride], dtype=np.int64)
+        correct_block(
+            inputs.image,
+            removed,
+            flags,
+            inputs.material,
+            np.ascontiguousarray(inputs.sun, real),
+            np.ascontiguousarray(inputs.view, real),
+            np.ascontiguousarray(inputs.normal, real),
+            engine.table,
+            self._pixels[np.dtype(real)],
+            tally,
+            options,
+        )
+
+
+def class_rows(classes: Array, rows: Mapping[int, int]) -> Array:
+    """The corrector's row of each pixel of a class map: uint8, 0 where the class has no material."""
+    if classes.dtype.kind not in "iu":
+        raise InputError(f"a class map holds {classes.dtype} values; allowed are integers")
+    if classes.dtype == np.uint8:
+        table = np.zeros(256, np.uint8)
+        for value, row in rows.items():
+            if 0 <= value < 256:
+                table[value] = row
+        return table[classes]
+    result = np.zeros(classes.shape, np.uint8)
+    for value, row in rows.items():
+        result[classes == value] = row
+    return result

@@ -1,0 +1,47 @@
+"""What was done to each pixel, as bits."""
+
+from enum import IntEnum, IntFlag
+from typing import Any
+
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+class PixelFlag(IntFlag):
+    """What was done to a pixel, and why not more. Two bits hold the `SpecularState`.
+
+    SELF_SHADOW to GRAZING, and the state, are assessed where a material with a peak is; LOW_CONFIDENCE and
+    NORMAL_UNRELIABLE say how good the inputs were.
+    """
+
+    NODATA = 1 << 0
+    NO_MATERIAL = 1 << 1
+    SELF_SHADOW = 1 << 2
+    CAST_SHADOW = 1 << 3
+    NOT_VIEWED = 1 << 4
+    GRAZING = 1 << 5
+    SPECULAR_STATE = 3 << 6
+    SATURATED = 1 << 8
+    CLIPPED = 1 << 9
+    UNCERTAIN = 1 << 10
+    NORMAL_UNRELIABLE = 1 << 11
+    LOW_CONFIDENCE = 1 << 12
+
+
+SPECULAR_STATE_SHIFT = 6
+SINGLE_FLAGS = tuple(flag for flag in PixelFlag if flag is not PixelFlag.SPECULAR_STATE)
+
+
+class SpecularState(IntEnum):
+    """The states of CEOS-ARD, in bits 6 and 7 of the flags."""
+
+    NEGLIGIBLE = 0
+    CORRECTED = 1
+    UNCORRECTABLE = 2
+    NOT_ASSESSED = 3
+
+
+def specular_state(flags: Array) -> Array:
+    """The `SpecularState` of each pixel of a flag layer."""
+    return (flags >> SPECULAR_STATE_SHIFT) & 3

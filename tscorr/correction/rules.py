@@ -1,0 +1,40 @@
+"""How the peak of a material is taken out, and what the stored values of an image mean."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+NEGLIGIBLE_REFLECTANCE = 5e-5
+"""threshold for images of floating point, which have no stored step"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rules:
+    """How the peak of one material is taken out; the settings [model] and [correction] of a configuration."""
+
+    form: Literal["full", "simplified"] = "full"
+    precision: Literal["fast", "exact", "reference"] = "fast"
+    negligible_reflectance: float = NEGLIGIBLE_REFLECTANCE
+    uncorrectable: Literal["best", "keep", "nodata"] = "best"
+    uncorrectable_share: float = 0.9
+    max_zenith_deg: float | None = None
+    irradiance_plane: Literal["horizontal", "facet"] = "horizontal"
+    direct_fraction: tuple[float, ...] = (1.0,)
+    enabled: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stored:
+    """What the stored values of an image mean: reflectance factor = scale * stored + offset, band by band."""
+
+    dtype: np.dtype[Any]
+    scale: tuple[float, ...]
+    offset: tuple[float, ...]
+    nodata: float | None = None
+    saturation: tuple[float, ...] | None = None
+
+    @property
+    def step(self) -> float | None:
+        """The finest step of reflectance that can be stored, or None for floating point."""
+        return min(map(abs, self.scale)) if self.dtype.kind in "iu" else None

@@ -1,0 +1,164 @@
+"""Materials, rules and stored values as the kernel reads them."""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from tscorr import kernels, reference
+from tscorr.correction.rules import Rules, Stored
+from tscorr.materials import BandParameters, Material, material
+
+Array = NDArray[Any]
+Entry = tuple[Material, BandParameters, Rules]
+"""a material, its parameters for each band, and how it is corrected"""
+
+MAX_ZENITH_DEG = {"full": 85.0, "simplified": 70.0}
+FRESNEL_ERROR = 3e-6
+"""relative error up to which a polynomial stands in for the Fresnel equations"""
+
+
+def pixel_rules(stored: Stored) -> dict[np.dtype[Any], kernels.PixelRules]:
+    """What stored values mean, in both widths of float, as the kernel reads it."""
+    bands, dtype = len(stored.scale), stored.dtype
+    integer = dtype.kind in "iu"
+    scale, offset = np.array(stored.scale), np.array(stored.offset)
+    black = -offset / scale
+    lowest = np.maximum(np.ceil(black - 1e-9), np.iinfo(dtype).min) if integer else black
+    if not integer and stored.nodata == 0:
+        lowest = np.where(lowest == 0, np.finfo(np.float32).tiny, lowest)
+    saturation = np.full(bands, np.inf) if stored.saturation is None else np.array(stored.saturation)
+    has_nodata = stored.nodata is not None and not np.isnan(stored.nodata)
+    return {
+        np.dtype(real): kernels.PixelRules(
+            scale=scale.astype(real),
+            offset=offset.astype(real),
+            steps=(1 / scale).astype(real),
+            saturation=saturation.astype(real),
+            lowest=lowest.astype(real),
+            nodata=np.array([0 if stored.nodata is None else stored.nodata]).astype(dtype),
+            has_nodata=has_nodata,
+            dodge=has_nodata and integer,
+            integer=integer,
+        )
+        for real in (np.float32, np.float64)
+    }
+
+
+def material_table(materials: Sequence[Entry], bands: int, real: type[np.floating[Any]]) -> kernels.MaterialTable:
+    """Materials and their rules as arrays of one float type; row 0 is "no material"."""
+    rows = [_material_row(*entry, bands) for entry in materials]
+    empty = _material_row(material("lambertian"), material("lambertian").at(bands=bands), Rules(enabled=False), bands)
+    columns: dict[str, Any] = {key: np.array([row[key] for row in (empty, *rows)]) for key in empty}
+    precise = {"w", "n", "k"}  # exact equations are evaluated in float64
+    for key, column in columns.items():
+        if column.dtype.kind == "f" and key not in precise:
+            columns[key] = column.astype(real)
+    return kernels.MaterialTable(**columns)
+
+
+def _material_row(surface: Material, parameters: BandParameters, rules: Rules, bands: int) -> dict[str, Any]:
+    beta = np.broadcast_to(np.array(rules.direct_fraction, dtype=float), bands)
+    gain = np.pi * beta * parameters.t1
+    low, high = surface.zenith_range_deg
+    limit = MAX_ZENITH_DEG[rules.form] if rules.max_zenith_deg is None else rules.max_zenith_deg
+    steepest = min(high, limit)
+    shared = np.zeros(bands, bool)
+    for key in ("w", "n", "k"):
+        values = getattr(parameters, key)
+        shared[1:] |= values[1:] != values[:-1]
+    shared = ~shared & (np.arange(bands) > 0)
+    gain_bound = gain.copy()
+    for band in range(bands - 2, -1, -1):
+        if shared[band + 1]:
+            gain_bound[band] = max(gain_bound[band], gain_bound[band + 1])
+    fits = [fresnel_polynomial(n, k, steepest) for n, k in zip(parameters.n, parameters.k, strict=True)]
+    cos_steepest = _cosine(steepest)
+    return {
+        "peak": bool(rules.enabled and np.any(gain > 0)),
+        "gain": gain,
+        "w": parameters.w,
+        "w2": np.rad2deg(parameters.w) ** 2,
+        "n": parameters.n,
+        "k": parameters.k,
+        "fresnel": [fit for fit, _ in fits],
+        "fresnel_scale": 2 / (1 - cos_steepest),
+        "fresnel_shift": -(1 + cos_steepest) / (1 - cos_steepest),
+        "fresnel_exact": [error > FRESNEL_ERROR for _, error in fits],
+        "fresnel_rises": _fresnel_rises(parameters.n, parameters.k),
+        "shared": shared,
+        "gain_bound": gain_bound,
+        "simplified": rules.form == "simplified",
+        "horizontal": rules.irradiance_plane == "horizontal",
+        "cos_min": cos_steepest,
+        "cos_max": _cosine(low) if low > 0 else 2.0,
+        "negligible": rules.negligible_reflectance,
+        "share": rules.uncorrectable_share,
+        "policy": {"best": kernels.BEST, "keep": kernels.KEEP, "nodata": kernels.BLANK}[rules.uncorrectable],
+    }
+
+
+def _cosine(zenith_deg: float) -> float:
+    return float(np.sin(np.deg2rad(90.0 - zenith_deg)))
+
+
+def _fresnel_rises(n: Array, k: Array) -> Array:
+    """Whether F rises with the local angle all the way: for n >= 1 and F(0) <= 1/3."""
+    normal_incidence = ((n - 1) ** 2 + k**2) / ((n + 1) ** 2 + k**2)
+    return (n >= 1) & (normal_incidence <= 1 / 3)
+
+
+@cache
+def fresnel_polynomial(n: float, k: float, max_zenith_deg: float) -> tuple[tuple[float, ...], float]:
+    """Coefficients of F over local angles from 0 to `max_zenith_deg`, and their largest relative error.
+
+    The polynomial is in x = cos_l mapped to [-1, 1], lowest power first, fitted with weights 1/F and checked
+    as the kernel evaluates it, in float32. The local angle never exceeds the larger of incidence and exitance,
+    so the range holds for every pixel that is assessed, however the scene is cut into blocks.
+    """
+    cos_min = _cosine(max_zenith_deg)
+    nodes = np.cos(np.pi * (np.arange(400) + 0.5) / 400)
+    values = reference.fresnel((1 - cos_min) / 2 * nodes + (1 + cos_min) / 2, n, k)  # type: ignore[arg-type]
+    if not np.all(values > 0):
+        return (0.0,) * (kernels.FRESNEL_DEGREE + 1), float("inf")
+    series = chebyshev.chebfit(nodes, values, kernels.FRESNEL_DEGREE, w=1 / values)
+    powers = chebyshev.cheb2poly(series)
+    powers = np.pad(powers, (0, kernels.FRESNEL_DEGREE + 1 - len(powers)))
+    cosines = np.linspace(cos_min, 1, 5001)
+    scale, shift = np.float32(2 / (1 - cos_min)), np.float32(-(1 + cos_min) / (1 - cos_min))
+    x = cosines.astype(np.float32) * scale + shift
+    result = np.zeros_like(x)
+    for coefficient in powers[::-1].astype(np.float32):
+        result = result * x + coefficient
+    exact = reference.fresnel(cosines.astype(np.float32).astype(float), n, k)  # type: ignore[arg-type]
+    return tuple(map(float, powers)), float(np.max(np.abs(result / exact - 1)))
+
+
+def new_tally(materials: int, bands: int) -> kernels.Tally:
+    """Empty sums for `materials` rows (with row 0) and `bands` bands."""
+    extremes = np.zeros((materials, 2))
+    extremes[:, 0] = np.inf
+    return kernels.Tally(
+        states=np.zeros((materials, 4), np.int64),
+        removed=np.zeros((materials, bands), np.int64),
+        incidence=np.zeros((materials, 360), np.int64),
+        tilt=np.zeros((materials, 900), np.int64),
+        share=np.zeros((materials, 201), np.int64),
+        extremes=extremes,
+        attenuated=np.zeros(2),
+        out_of_lobe=np.zeros(1, np.int64),
+    )
+
+
+def add_tally(total: kernels.Tally, part: kernels.Tally) -> None:
+    """Add the sums of a block to those of the scene; integers and extremes, so no order matters."""
+    for name in ("states", "removed", "incidence", "tilt", "share", "out_of_lobe"):
+        sums = getattr(total, name)
+        sums += getattr(part, name)
+    total.extremes[:, 0] = np.minimum(total.extremes[:, 0], part.extremes[:, 0])
+    total.extremes[:, 1] = np.maximum(total.extremes[:, 1], part.extremes[:, 1])
+    total.attenuated[0] += part.attenuated[0]
+    total.attenuated[1] = max(total.attenuated[1], part.attenuated[1])
