@@ -1,0 +1,197 @@
+"""Surface normals straight from the heights of a DSM, one small window a pixel.
+
+Heights are (rows, cols), row 0 in the north, columns from west to east, nan = void, in metres as
+`cell_x_m` and `cell_y_m` are. Normals are float32 (3, rows, cols): east, north, up, of unit length.
+
+Where the window is not whole (a void, the border of the array), the normal is that of the
+least-squares plane through the heights that are there, and straight up where these are less than
+three or in one line. So planes come out right up to the border, but a tile gives the pixels of the
+whole scene only where its halo (1 for Horn, `radius` for a plane fit) completes the window.
+
+`unreliable` is set where there is a void or a step edge under the window. A step is a second
+difference z(-1) - 2 z(0) + z(+1), along rows, columns or diagonals, of more than `step_m`. A plane has
+none, a ridge has the sum of its two slopes times the cell, n metres of noise make 2.4 n. The default is
+the larger cell size: what a ridge of two slopes of 27 degrees shows, and there the normal of a window
+is that of neither face.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tscorr.errors import InputError
+
+HORN_HALO_PX = 1
+
+
+class WindowNormals(NamedTuple):
+    """Normals float32 (3, rows, cols), and `unreliable` bool (rows, cols): a void or a step below."""
+
+    normals: NDArray[np.float32]
+    unreliable: NDArray[np.bool_]
+
+
+def horn_normals(
+    heights: NDArray[np.floating[Any]], *, cell_x_m: float, cell_y_m: float, step_m: float | None = None
+) -> WindowNormals:
+    """Normals by the 3 x 3 weights 1 2 1 of Horn 1981 (Proc. IEEE 69, 14, eq. for p_w and q_w)."""
+    z = np.ascontiguousarray(heights)
+    normals = np.empty((3, *z.shape), np.float32)
+    _horn(z, normals, 1.0 / (8.0 * cell_x_m), 1.0 / (8.0 * cell_y_m))
+    unreliable = _unreliable(z, 1, max(cell_x_m, cell_y_m) if step_m is None else step_m)
+    _complete(z, normals, unreliable, 1, cell_x_m, cell_y_m)
+    return WindowNormals(normals, unreliable)
+
+
+def plane_fit_normals(
+    heights: NDArray[np.floating[Any]],
+    *,
+    cell_x_m: float,
+    cell_y_m: float,
+    radius: int = 1,
+    step_m: float | None = None,
+) -> WindowNormals:
+    """Normals of the least-squares planes in windows of (2 radius + 1)^2 pixels, radius >= 1."""
+    if radius < 1:
+        raise InputError(f"radius is {radius}; a window needs a radius of 1 or more")
+    z = np.ascontiguousarray(heights)
+    normals = np.empty((3, *z.shape), np.float32)
+    _plane_fit(z, normals, radius, 1.0 / cell_x_m, 1.0 / cell_y_m)
+    unreliable = _unreliable(z, radius, max(cell_x_m, cell_y_m) if step_m is None else step_m)
+    _complete(z, normals, unreliable, radius, cell_x_m, cell_y_m)
+    return WindowNormals(normals, unreliable)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _horn(z, normals, per_x, per_y):
+    """Normals of all pixels off the border; nan where the window has a void."""
+    rows, cols = z.shape
+    per_x, per_y, one = np.float32(per_x), np.float32(per_y), np.float32(1.0)
+    for i in range(1, rows - 1):
+        # Three short loops with few arrays in each: only so do they become vector instructions.
+        # Differences come first: they are exact where the heights are near each other.
+        above, here, below = z[i - 1], z[i], z[i + 1]
+        east, north, up = normals[0, i], normals[1, i], normals[2, i]
+        for j in range(1, cols - 1):
+            fall = here[j - 1] - here[j + 1]
+            falls = (above[j - 1] - above[j + 1]) + (fall + fall) + (below[j - 1] - below[j + 1])
+            east[j] = np.float32(falls) * per_x
+        for j in range(1, cols - 1):
+            fall = below[j] - above[j]
+            falls = (below[j - 1] - above[j - 1]) + (fall + fall) + (below[j + 1] - above[j + 1])
+            north[j] = np.float32(falls) * per_y
+        for j in range(1, cols - 1):
+            up[j] = one / np.sqrt(one + east[j] * east[j] + north[j] * north[j])
+            east[j] *= up[j]
+            north[j] *= up[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _plane_fit(z, normals, radius, per_x, per_y):
+    """Normals of all pixels with a full window in the array; nan where it has a void."""
+    rows, cols = z.shape
+    spread = (2 * radius + 1) ** 2 * radius * (radius + 1) / 3.0  # sum of the squared offsets
+    total, tilt = np.empty(cols), np.empty(cols)  # of the window's columns: sum, offset * height
+    for i in range(radius, rows - radius):
+        total[:] = 0.0
+        tilt[:] = 0.0
+        for a in range(1, radius + 1):
+            for j in range(cols):
+                total[j] += z[i + a, j] + z[i - a, j]
+                tilt[j] += a * (z[i + a, j] - z[i - a, j])
+        for j in range(cols):
+            total[j] += z[i, j]
+        for j in range(radius, cols - radius):
+            by_col, by_row = 0.0, tilt[j]
+            for b in range(1, radius + 1):
+                by_col += b * (total[j + b] - total[j - b])
+                by_row += tilt[j + b] + tilt[j - b]
+            _set_normal(normals, i, j, -by_col / spread * per_x, by_row / spread * per_y)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _set_normal(normals, i, j, east, north):
+    """Write the normal of a surface that falls `east` to the east and `north` to the north, per metre."""
+    up = 1.0 / math.sqrt(1.0 + east * east + north * north)
+    normals[0, i, j] = east * up
+    normals[1, i, j] = north * up
+    normals[2, i, j] = up
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _complete(z, normals, unreliable, radius, cell_x_m, cell_y_m):
+    """Normals where the window is not whole: at the border of the array and at voids."""
+    rows, cols = z.shape
+    for i in range(rows):
+        inner_row = radius <= i < rows - radius
+        for j in range(cols):
+            inner = inner_row and radius <= j < cols - radius
+            if inner and not (unreliable[i, j] and math.isnan(normals[2, i, j])):
+                continue
+            n, x, y, h, xx, xy, yy, xh, yh = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            datum = 0.0
+            for a in range(max(0, i - radius), min(rows, i + radius + 1)):
+                for b in range(max(0, j - radius), min(cols, j + radius + 1)):
+                    if not math.isfinite(z[a, b]):
+                        continue
+                    if n == 0:
+                        datum = z[a, b]
+                    u, v, d = (b - j) * cell_x_m, (i - a) * cell_y_m, z[a, b] - datum
+                    n += 1
+                    x += u
+                    y += v
+                    h += d
+                    xx += u * u
+                    xy += u * v
+                    yy += v * v
+                    xh += u * d
+                    yh += v * d
+            east, north = 0.0, 0.0
+            if n >= 3:
+                xx, xy, yy = xx - x * x / n, xy - x * y / n, yy - y * y / n
+                xh, yh = xh - x * h / n, yh - y * h / n
+                determinant = xx * yy - xy * xy
+                if determinant > 1e-6 * (xx + yy) ** 2:
+                    east = (yh * xy - xh * yy) / determinant
+                    north = (xh * xy - yh * xx) / determinant
+            _set_normal(normals, i, j, east, north)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _bent(z, bent, step):
+    """Whether the 3 x 3 heights around each pixel off the border have a void or a step."""
+    for i in range(1, z.shape[0] - 1):
+        above, here, below, out = z[i - 1], z[i], z[i + 1], bent[i]
+        for j in range(1, z.shape[1] - 1):
+            twice = here[j] + here[j]
+            flat = (
+                (abs(here[j - 1] - twice + here[j + 1]) <= step)
+                & (abs(above[j] - twice + below[j]) <= step)
+                & (abs(above[j - 1] - twice + below[j + 1]) <= step)
+                & (abs(above[j + 1] - twice + below[j - 1]) <= step)
+            )
+            out[j] = not flat  # a nan is never flat
+
+
+def _unreliable(z: NDArray[np.floating[Any]], radius: int, step: float) -> NDArray[np.bool_]:
+    """Pixels with a void or step in the window; where it reaches over the border, in what is there."""
+    rows, cols = z.shape
+    if min(rows, cols) < 3:
+        return np.ones(z.shape, np.bool_)  # no window shows whether the surface is plane
+    bent = np.zeros(z.shape, np.bool_)
+    _bent(z, bent, step)
+    # a border pixel's window lies in that of its inner neighbour
+    bent[0], bent[-1] = bent[1], bent[-2]
+    bent[:, 0], bent[:, -1] = bent[:, 1], bent[:, -2]
+    for axis in (0, 1):
+        spread = bent.copy()
+        for shift in range(1, min(radius, z.shape[axis])):
+            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], behind[axis] = slice(shift, None), slice(None, -shift)
+            spread[tuple(ahead)] |= bent[tuple(behind)]
+            spread[tuple(behind)] |= bent[tuple(ahead)]
+        bent = spread
+    return bent
