@@ -1,0 +1,50 @@
+"""Materials as a TOML file that `tscorr.materials.load_materials` reads: what a fit leaves behind."""
+
+import math
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from tscorr.errors import OutputError
+from tscorr.materials import PARAMETERS, Material
+
+HEAD = "# Torrance-Sparrow parameters: t0, t1 in 1/sr, w in 1/degree; the covariance is that of t0, t1, w, n\n"
+
+
+def materials_toml(materials: Iterable[Material]) -> str:
+    """The text of a material library."""
+    return HEAD + "\n" + tomli_w.dumps({material.name: _table(material) for material in materials})
+
+
+def save_materials(materials: Iterable[Material], path: str | Path) -> None:
+    """Write a material library, whole or not at all."""
+    path = Path(path)
+    hidden = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        hidden.write_text(materials_toml(materials), encoding="utf-8")
+        hidden.replace(path)
+    except OSError as error:
+        hidden.unlink(missing_ok=True)
+        raise OutputError(f"the materials {path} cannot be written: {error}") from None
+
+
+def _table(material: Material) -> dict[str, Any]:
+    """Only what the material says: one value as a number, several as a list."""
+    table: dict[str, Any] = {
+        "source": material.source,
+        "wavelength_um": _plain(material.wavelength_um),
+        **{name: _plain(getattr(material, name)) for name in PARAMETERS},
+        "sigma": dict(material.sigma),
+        "covariance": [list(row) for row in material.covariance],
+        "zenith_range_deg": list(material.zenith_range_deg),
+    }
+    if not math.isnan(material.chi2_dof):
+        table["chi2_dof"] = material.chi2_dof
+    return {key: value for key, value in table.items() if value not in ("", [], {})}
+
+
+def _plain(values: tuple[float, ...]) -> float | list[float]:
+    return values[0] if len(values) == 1 else list(values)
