@@ -1,0 +1,120 @@
+"""Publishing a result: an output folder is whole or absent.
+
+Work happens in a hidden sibling folder on the same file system; the manifest is written last, everything is
+flushed to disk, and one rename puts the folder in its place.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+from tscorr.errors import OutputError
+
+MANIFEST = "manifest.json"
+
+
+class Publication:
+    """A folder in the making: write into `.folder`, then `commit`. Leaving without a commit deletes it."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+        self.folder = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+
+    def __enter__(self) -> Self:
+        try:
+            self.folder.mkdir(parents=True)
+        except OSError as error:
+            raise OutputError(f"the output folder {self.folder.parent} cannot be written: {error}") from None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def commit(self, manifest: Mapping[str, Any]) -> None:
+        """Write the manifest with the hashes of all files, flush, and take the target's place."""
+        try:
+            files = sorted(path for path in self.folder.iterdir() if path.name != MANIFEST)
+            outputs = {path.name: {"sha256": sha256(path), "bytes": path.stat().st_size} for path in files}
+            path = self.folder / MANIFEST
+            path.write_text(json.dumps({**manifest, "outputs": outputs}, indent=1) + "\n", encoding="utf-8")
+            for file in (*files, path):
+                _flush(file)
+            _flush(self.folder)
+            self._replace()
+        except OSError as error:
+            raise OutputError(f"{self.target} cannot be published: {error}") from None
+
+    def _replace(self) -> None:
+        old = self.target.with_name(f".{self.target.name}.{uuid.uuid4().hex[:8]}.old")
+        if self.target.exists():
+            self.target.rename(old)
+        self.folder.rename(self.target)
+        _flush(self.target.parent)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file, as hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def identity(path: Path) -> dict[str, Any]:
+    """What tells one version of an input from another without reading it: name, size, time of change."""
+    status = path.stat()
+    return {"path": str(path.resolve()), "bytes": status.st_size, "changed_ns": status.st_mtime_ns}
+
+
+def key(settings: Mapping[str, Any], inputs: Iterable[Path], version: str) -> str:
+    """Digest of everything that a result depends on; equal keys mean that nothing has to be done."""
+    content = {"settings": settings, "inputs": [identity(path) for path in inputs], "version": version}
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def is_current(target: Path, wanted: str) -> bool:
+    """Whether a published folder is whole and was made with this key."""
+    manifest = read_manifest(target)
+    if manifest is None or manifest.get("key") != wanted:
+        return False
+    outputs = manifest.get("outputs", {})
+    return all(
+        (target / name).is_file() and (target / name).stat().st_size == entry["bytes"]
+        for name, entry in outputs.items()
+    )
+
+
+def read_manifest(target: Path) -> dict[str, Any] | None:
+    """The manifest of a published folder, or None where there is none."""
+    try:
+        manifest = json.loads((target / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return manifest if isinstance(manifest, dict) else None
+
+
+def damaged(target: Path) -> list[str]:
+    """What is wrong with a published folder: files missing or changed since; empty where all is well."""
+    manifest = read_manifest(target)
+    if manifest is None:
+        return [f"{target / MANIFEST} is missing or not a manifest"]
+    problems = []
+    for name, entry in manifest["outputs"].items():
+        path = target / name
+        if not path.is_file():
+            problems.append(f"{path} is missing")
+        elif sha256(path) != entry["sha256"]:
+            problems.append(f"{path} has changed since it was published")
+    return problems
+
+
+def _flush(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,1 @@
+"""One scene: plan, read, correct, write, in a bounded pipeline."""

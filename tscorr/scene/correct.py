@@ -1,0 +1,167 @@
+"""Correct a scene and publish its folder: rasters, picture, report, settings, manifest."""
+
+import resource
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from tscorr import __version__, publish, rasters
+from tscorr.angles import relative_azimuth, true_azimuth, zenith_azimuth
+from tscorr.grid import Block, Grid, longitude_latitude
+from tscorr.report import SceneFacts, page, summary, write_json
+from tscorr.scene.plan import Scene
+from tscorr.scene.run import Pipeline, Progress, silent
+from tscorr.scene.truth import residual_glare
+from tscorr.sun import solar_path
+
+Array = NDArray[Any]
+
+VIEW_SAMPLES = 48
+"""the report samples the view directions on a grid of at most this many points a side"""
+PICTURE_PX = 768
+
+
+def settings_of(scene: Scene) -> dict[str, Any]:
+    """The settings of one scene, defaults filled in: what settings.toml holds."""
+    values = scene.config.model_dump(mode="json", exclude_none=True, exclude={"scenes"})
+    values["scenes"] = [scene.settings.model_dump(mode="json", exclude_none=True)]
+    values["output"].pop("directory")
+    return values
+
+
+def resume_key(scene: Scene) -> str:
+    """Digest of all that a scene's result depends on: settings, inputs, materials and version, not the machine."""
+    settings = settings_of(scene)
+    settings.pop("run")
+    settings.pop("title")
+    materials = [repr((surface, rules)) for surface, _, rules in scene.materials]
+    return publish.key({"settings": settings, "materials": materials}, scene.inputs, __version__)
+
+
+def target_of(scene: Scene) -> Path:
+    """The folder that a scene is published in."""
+    return Path(scene.config.output.directory) / scene.name
+
+
+def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
+    """Correct a scene and publish its folder; the content of its report.json."""
+    started = time.perf_counter()
+    with publish.Publication(target_of(scene)) as publication:
+        pipeline = Pipeline(scene, publication.folder)
+        pipeline.run(progress)
+        facts = facts_of(scene, pipeline, time.perf_counter() - started)
+        folder = publication.folder
+        report = summary(facts)
+        corrected = folder / "corrected.tif"
+        if corrected.exists() and (residual := residual_glare(scene, corrected)) is not None:
+            report["residual_glare"] = residual
+        picture = draw_quicklook(scene, folder) if scene.config.output.quicklook else None
+        write_json(report, folder / "report.json")
+        widths = _decimated_widths(folder)
+        (folder / "report.html").write_text(page(report, facts, picture, widths), encoding="utf-8")
+        (folder / "settings.toml").write_text(tomli_w.dumps(settings_of(scene)), encoding="utf-8")
+        publication.commit(
+            {
+                "scene": scene.name,
+                "tscorr": __version__,
+                "key": resume_key(scene),
+                "inputs": {str(path): {"sha256": publish.sha256(path)} for path in scene.inputs},
+            }
+        )
+    return report
+
+
+def facts_of(scene: Scene, pipeline: Pipeline, wall_s: float) -> SceneFacts:
+    """What the report needs to know of a finished scene."""
+    zenith, azimuth = _view_samples(scene)
+    sun, sums = scene.sun, pipeline.sums
+    middle = zenith.shape[0] // 2, zenith.shape[1] // 2
+    return SceneFacts(
+        scene=scene.name,
+        image=scene.image.path.name,
+        bands=scene.image.names,
+        wavelengths_um=scene.wavelengths_um or (float("nan"),) * scene.image.bands,
+        materials=scene.materials,
+        tally=sums.tally,
+        tally_stride=scene.tally_stride,
+        flag_counts=sums.flag_counts(),
+        skipped=sums.skipped,
+        uncertainty_evaluated=False,
+        solar_zenith_deg=sun.zenith_deg,
+        solar_azimuth_deg=sun.azimuth_deg,
+        convergence_deg=sun.convergence_deg,
+        sun_at=_sun_later(scene),
+        view_zenith_deg=zenith,
+        view_azimuth_deg=azimuth,
+        relative_azimuth_deg=relative_azimuth(azimuth, sun.azimuth_deg),
+        centre_view_deg=(float(zenith[middle]), float(azimuth[middle])),
+        seconds={"wall": wall_s, **sums.seconds},
+        peak_rss_mb=peak_rss_mb(),
+        version=__version__,
+    )
+
+
+def _view_samples(scene: Scene) -> tuple[Array, Array]:
+    """View zenith angle and azimuth from true north on a coarse grid over the scene. [deg]"""
+    rows, cols = scene.image.shape
+    count_rows, count_cols = min(rows, VIEW_SAMPLES), min(cols, VIEW_SAMPLES)
+    step = scene.grid.transform.scale(cols / count_cols, rows / count_rows)
+    coarse = Grid(scene.grid.crs, scene.grid.transform @ step, (count_rows, count_cols))
+    block = Block(0, 0, count_rows, count_cols)
+    vectors = scene.view.vectors(coarse, block, np.full((1, 1), scene.ground_level_m))
+    vectors = np.broadcast_to(vectors, (3, count_rows, count_cols))
+    zenith, azimuth = zenith_azimuth(vectors)
+    return zenith, true_azimuth(azimuth, scene.sun.convergence_deg)
+
+
+def _sun_later(scene: Scene) -> Any:
+    """Function of minutes to solar zenith angle and azimuth, where the time is known."""
+    start = scene.settings.sun.time if scene.settings.sun is not None else None
+    if start is None:
+        return None
+    longitude, latitude = map(float, longitude_latitude(scene.grid, *scene.grid.center))
+    return lambda minutes: solar_path(start, minutes, latitude, longitude)
+
+
+def draw_quicklook(scene: Scene, folder: Path) -> Path:
+    """The picture of before, after and flags, of a scene that is being published."""
+    from tscorr.quicklook import before_after, linear_rgb, rendering_note, rgb_matrix, used_bands
+
+    image = scene.image
+    wavelengths = scene.wavelengths_um or (float("nan"),) * image.bands
+    matrix = rgb_matrix(wavelengths, image.fwhm_um)
+    used = used_bands(matrix)
+    corrected = folder / "corrected.tif"
+    result = rasters.describe(corrected) if corrected.exists() else image
+    before, after = (linear_rgb(_bands(scene, info, used), matrix[used]) for info in (image, result))
+    path = folder / "quicklook.png"
+    flag_file = folder / "flags.tif"
+    flags = np.zeros(before.shape[:2], np.uint16)
+    if flag_file.exists():
+        flags = rasters.read_decimated_flags(rasters.describe(flag_file), PICTURE_PX)
+    before_after(before, after, flags, path, title=scene.name, note=rendering_note(wavelengths, matrix))
+    return path
+
+
+def _bands(scene: Scene, info: rasters.RasterInfo, bands: Iterable[int]) -> Iterator[Array]:
+    """Reflectance factor of some bands, decimated, one after the other."""
+    for band in bands:
+        stored = rasters.read_decimated(info, PICTURE_PX, [band + 1])[0]
+        yield stored * scene.stored.scale[band] + scene.stored.offset[band]
+
+
+def _decimated_widths(folder: Path) -> Array | None:
+    path = folder / "azimuthal_width.tif"
+    return rasters.read_decimated(rasters.describe(path), PICTURE_PX)[0] if path.exists() else None
+
+
+def peak_rss_mb() -> float:
+    """The most memory that this process has used so far. [MB]"""
+    unit = 1e6 if sys.platform == "darwin" else 1e3
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

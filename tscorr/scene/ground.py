@@ -1,0 +1,203 @@
+"""The ground of a scene: its surface, and what is in shadow or hidden, over the pixels of the image."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.enums import Resampling
+
+from tscorr import config, rasters
+from tscorr.correction.edges import dilated, rim
+from tscorr.errors import InputError
+from tscorr.grid import Block
+from tscorr.scene.plan import Scene
+from tscorr.sensor import ConstantView, FrameView, LineView
+from tscorr.terrain import shadows
+from tscorr.terrain.bitmask import BitMask
+from tscorr.terrain.roof_planes import height_noise
+from tscorr.terrain.surface import DsmSurface, FlatSurface, GivenNormals, RoofPlaneSurface, Surface
+
+Array = NDArray[Any]
+
+STRIP_ROWS = 512
+SAMPLE_PX = 256
+SAMPLES = 4
+"""the survey looks at SAMPLES x SAMPLES windows of SAMPLE_PX"""
+MARGIN_PX = 512
+"""pixels around the image that are looked at for what they hide; farther things cast no shadow"""
+
+
+class Ground:
+    """Surface, shadows and occlusion of a scene; close it to close its files."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._files = ExitStack()
+        self._heights = self._heights_reader()
+        self._level_m, self._relief_m, self._noise_m = self._survey()
+        self.surface: Surface = self._surface()
+        self._lit: BitMask | None = None
+        self._seen: BitMask | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._files.close()
+
+    def _heights_reader(self) -> rasters.Reader | None:
+        info = self._scene.heights_file
+        if info is None:
+            return None
+        reader = rasters.Reader(
+            info, self._scene.grid, resampling=Resampling.bilinear, fill=float("nan"), margin=MARGIN_PX
+        )
+        return self._files.enter_context(reader)
+
+    def _read_heights(self, block: Block) -> Array:
+        assert self._heights is not None
+        return self._heights.read(block, 1)
+
+    def _survey(self) -> tuple[float, float, float]:
+        """Middle height, relief and noise of the surface, from windows spread over the scene. [m]"""
+        if self._heights is None:
+            return 0.0, 0.0, 0.0
+        rows, cols = self._scene.image.shape
+        corners = {
+            (
+                max(0, round((rows - SAMPLE_PX) * i / (SAMPLES - 1))),
+                max(0, round((cols - SAMPLE_PX) * j / (SAMPLES - 1))),
+            )
+            for i in range(SAMPLES)
+            for j in range(SAMPLES)
+        }
+        windows = [
+            self._read_heights(Block(row, col, min(SAMPLE_PX, rows - row), min(SAMPLE_PX, cols - col)))
+            for row, col in sorted(corners)
+        ]
+        heights = np.concatenate([window[np.isfinite(window)] for window in windows])
+        if not heights.size:
+            raise InputError(f"the surface model {self._heights.info.path} holds no heights under the image")
+        noise = float(np.median([height_noise(window) for window in windows]))
+        return float(np.median(heights)), float(np.ptp(heights)), noise
+
+    def _surface(self) -> Surface:
+        settings = self._scene.settings.surface
+        cell_x_m, cell_y_m = self._scene.grid.cell_size
+        if isinstance(settings, config.FlatSettings):
+            return FlatSurface(settings.height_m)
+        level = self._level_m
+        if isinstance(settings, config.DsmSettings) and settings.kind == "roof_planes":
+            return RoofPlaneSurface(
+                self._read_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level, noise_m=self._noise_m
+            )
+        dsm: Surface = FlatSurface(0.0)
+        if self._heights is not None:
+            dsm = DsmSurface(self._read_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level)
+        if isinstance(settings, config.DsmSettings):
+            return dsm
+        info = self._scene.surface_files[-1]
+        normals = self._files.enter_context(
+            rasters.Reader(info, self._scene.grid, resampling=Resampling.nearest, fill=float("nan"))
+        )
+        return GivenNormals(normals.read, dsm)
+
+    def prepare(self) -> None:
+        """Find what is in shadow and what is hidden, once, before the first block is asked for."""
+        if self._heights is None or not self._scene.settings.shadows:
+            return
+        self._lit = self._swept(lambda **scene: shadows.DirectionSweep(direction=self._sun(), **scene), self._sun())
+        self._seen = self._seen_mask()
+
+    def _sun(self) -> Array:
+        return self._scene.sun.center
+
+    def _seen_mask(self) -> BitMask | None:
+        """What a sensor sees, where one sweep can tell; otherwise it is found block by block."""
+        view, grid = self._scene.view, self._scene.grid
+        if isinstance(view, ConstantView):
+            direction = view.vectors(grid, Block(0, 0, 1, 1), np.zeros((1, 1)))[:, 0, 0]
+            return self._swept(lambda **scene: shadows.DirectionSweep(direction=direction, **scene), direction)
+        if isinstance(view, FrameView):
+            return self._swept(lambda **scene: shadows.FrameSweep(position=self._local(view.position), **scene))
+        if isinstance(view, LineView) and (ends := view.straight(grid)) is not None:
+            start, end = map(self._local, ends)
+            return self._swept(lambda **scene: shadows.LineSweep(start=start, end=end, **scene))
+        return None
+
+    def _local(self, position: Any) -> tuple[float, float, float]:
+        """A position relative to the centre of the image's first pixel: metres east, north, and up."""
+        x0, y0 = self._scene.grid.xy(0, 0)
+        return float(position[0] - x0), float(position[1] - y0), float(position[2])
+
+    def _swept(self, sweep_of: Callable[..., shadows.Sweep], direction: Array | None = None) -> BitMask:
+        """The mask of a sweep over the image, and over what lies around it towards the source."""
+        rows, cols = self._scene.image.shape
+        cell_x_m, cell_y_m = self._scene.grid.cell_size
+        margin = self._margin(direction)
+        mask = BitMask((rows, cols))
+        sweep = sweep_of(shape=(rows + 2 * margin, cols + 2 * margin), cell_x_m=cell_x_m, cell_y_m=cell_y_m)
+        for strip in sweep.strips(STRIP_ROWS):
+            block = Block(strip.row - margin, strip.col - margin, strip.height, strip.width)
+            mask.narrow(block, sweep(strip, self._read_heights(block)))
+        return mask
+
+    def _margin(self, direction: Array | None) -> int:
+        """Pixels around the image that can hide something in it from a source in this direction."""
+        if direction is None or not self._reaches_beyond():
+            return 0
+        zenith = np.rad2deg(np.arctan2(np.hypot(direction[0], direction[1]), direction[2]))
+        reach = shadows.reach_m(self._relief_m, float(zenith)) / min(self._scene.grid.cell_size)
+        return min(MARGIN_PX, int(np.ceil(reach)) + 1)
+
+    def _reaches_beyond(self) -> bool:
+        """Whether the surface model covers more than the image."""
+        assert self._heights is not None
+        rows, cols = self._scene.image.shape
+        ring = (
+            Block(-1, 0, 1, cols),
+            Block(rows, 0, 1, cols),
+            Block(0, -1, rows, 1),
+            Block(0, cols, rows, 1),
+        )
+        return any(np.isfinite(self._read_heights(block)).any() for block in ring)
+
+    def shadowed(self, block: Block) -> tuple[Array, Array] | None:
+        """Where something stands between the block and the sun, and where that is unsure by a pixel.
+
+        None where nothing was looked for.
+        """
+        if self._lit is None:
+            return None
+        lit = self._lit.read(block.padded(1))
+        return ~lit[1:-1, 1:-1], rim(lit)
+
+    def hidden(self, block: Block, needed: Array) -> Array | None:
+        """Where something stands between the block and the sensor, or None where nothing was looked for.
+
+        A pixel beside a visible one counts as seen: the surface model is unsure by a pixel, and the image has a
+        value there. Only the `needed` pixels are asked for where every pixel costs a ray.
+        """
+        if self._heights is None or not self._scene.settings.shadows:
+            return None
+        around = block.padded(1)
+        seen = (
+            self._seen.read(around)
+            if self._seen is not None
+            else self._marched(around, np.pad(needed, 1, mode="edge"))
+        )
+        return ~dilated(seen)
+
+    def _marched(self, block: Block, needed: Array) -> Array:
+        """Which pixels of a block the sensor sees, ray by ray."""
+        grid = self._scene.grid
+        view = self._scene.view.vectors(grid, block, self.surface.heights(block))
+        zenith = float(np.rad2deg(np.arctan2(np.hypot(view[0], view[1]), view[2])).max())
+        cell_x_m, cell_y_m = grid.cell_size
+        reach = shadows.reach_m(self._relief_m, min(zenith, 80.0)) / min(cell_x_m, cell_y_m)
+        halo = min(MARGIN_PX, int(np.ceil(reach)) + 1)
+        window = slice(halo, halo + block.height), slice(halo, halo + block.width)
+        heights = self._read_heights(block.padded(halo))
+        return shadows.march(heights, view, cell_x_m=cell_x_m, cell_y_m=cell_y_m, window=window, needed=needed)

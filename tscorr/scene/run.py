@@ -1,0 +1,297 @@
+"""A scene from files to files: read, correct, write, in blocks, by several workers."""
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tscorr import __version__, rasters
+from tscorr.angles import angle_between, facet_angles, true_azimuth, zenith_azimuth
+from tscorr.correction import (
+    SINGLE_FLAGS,
+    BlockInputs,
+    BlockResult,
+    Corrector,
+    add_tally,
+    class_rows,
+    new_tally,
+)
+from tscorr.correction.edges import ShadowByBrightness
+from tscorr.grid import Block, blocks
+from tscorr.scene.ground import Ground
+from tscorr.scene.plan import Scene
+from tscorr.width import WidthTable, lobe_shapes
+
+Array = NDArray[Any]
+Progress = Callable[[int], None]
+"""told the number of pixels done since the last call"""
+
+
+def silent(pixels: int) -> None:
+    """Progress that nobody watches."""
+    del pixels
+
+
+UNIT_COLUMNS = 2048
+STRIPE_COLUMNS = 8192
+UNIT_BYTES = 16e6
+MOST_WORKERS = 4
+ANGLE_NAMES = (
+    "incidence",
+    "exitance",
+    "relative_azimuth",
+    "facet_tilt",
+    "local_angle",
+    "solar_zenith",
+    "solar_azimuth",
+    "view_zenith",
+    "view_azimuth",
+)
+
+
+class Sums:
+    """What the blocks of a scene add up to; integers and extremes, so that their order cannot matter."""
+
+    def __init__(self, materials: int, bands: int) -> None:
+        self.tally = new_tally(materials + 1, bands)
+        self.flags = np.zeros(1 << 16, np.int64)
+        self.skipped = dict.fromkeys(
+            ("blocks", "blocks_no_specular_material", "blocks_out_of_reach", "blocks_shadow_or_nodata"), 0
+        )
+        self.seconds = dict.fromkeys(("read", "geometry", "kernel", "write"), 0.0)
+        self._lock = threading.Lock()
+
+    def add(self, result: BlockResult, kind: str | None) -> None:
+        """Add a block; `kind` says why most of its work was skipped, if it was."""
+        counts = np.bincount(result.flags.ravel(), minlength=1 << 16)
+        with self._lock:
+            add_tally(self.tally, result.tally)
+            self.flags += counts
+            self.skipped["blocks"] += 1
+            if kind is not None:
+                self.skipped[kind] += 1
+
+    def flag_counts(self) -> dict[str, int]:
+        """Pixels with each flag, by name."""
+        values = np.arange(1 << 16)
+        return {str(flag.name): int(self.flags[(values & flag) != 0].sum()) for flag in SINGLE_FLAGS}
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Add the time of a block of code to one part of the work; summed over the workers."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self.seconds[part] += time.perf_counter() - start
+
+
+def units(image: rasters.RasterInfo) -> list[Block]:
+    """Blocks that the work is cut into: whole tiles of the image, stripe by stripe.
+
+    Results do not depend on the cut; memory and speed do.
+    """
+    rows, cols = image.shape
+    tile_rows, tile_cols = image.tile
+    pixel_bytes = image.bands * image.dtype.itemsize
+    width = cols if tile_cols >= cols else max(1, UNIT_COLUMNS // tile_cols) * tile_cols
+    room = int(UNIT_BYTES / pixel_bytes / min(width, cols))
+    height = max(1, min(room, 512) // tile_rows) * tile_rows
+    stripe = max(width, STRIPE_COLUMNS // width * width)
+    return [
+        Block(block.row, first + block.col, block.height, block.width)
+        for first in range(0, cols, stripe)
+        for block in blocks((rows, min(stripe, cols - first)), (height, width))
+    ]
+
+
+class Pipeline:
+    """The work on one scene: open files, one method a block, and the rasters being written."""
+
+    def __init__(self, scene: Scene, folder: Path) -> None:
+        self.scene = scene
+        self.folder = folder
+        self.corrector = Corrector(
+            scene.materials, scene.stored, skip=scene.config.run.skip, tally_stride=scene.tally_stride
+        )
+        self._by_brightness = ShadowByBrightness.of(scene.materials, scene.stored, scene.wavelengths_um)
+        self.sums = Sums(len(scene.materials), scene.image.bands)
+        self._products = set(scene.config.output.products)
+        self._tables = [
+            WidthTable(shapes[len(shapes) // 2], rules.form) if peak else None
+            for (_, parameters, rules), peak in zip(scene.materials, self.corrector.peaks[1:], strict=True)
+            for shapes in [lobe_shapes(parameters)]
+        ]
+
+    def run(self, progress: Progress) -> None:
+        """All blocks, by the workers of the configuration; the first error stops the rest."""
+        scene = self.scene
+        with ExitStack() as files:
+            self.image = files.enter_context(rasters.Reader(scene.image))
+            self.classes = files.enter_context(rasters.Reader(scene.class_map, scene.grid))
+            self.ground = files.enter_context(Ground(scene))
+            if self.corrector.peaks.any():
+                with self.sums.timed("geometry"):
+                    self.ground.prepare()
+            self.writers = {name: self._writer(name) for name in sorted(self._products)}
+            try:
+                run_all(self.block, units(scene.image), workers_of(scene), progress)
+            except BaseException:
+                for writer in self.writers.values():
+                    writer.abandon()
+                raise
+            with self.sums.timed("write"):
+                for writer in self.writers.values():
+                    writer.close()
+
+    def block(self, block: Block) -> int:
+        """Read, correct and write one block; the number of its pixels."""
+        with self.sums.timed("read"):
+            rows = class_rows(self.classes.read(block, 1), self.scene.rows)
+            image = self.image.read(block)
+        needed = self.corrector.peaks[rows]
+        skipped = None if needed.any() else "blocks_no_specular_material"
+        with self.sums.timed("geometry"):
+            inputs = self.inputs(block, image, rows, needed)
+        layers = self._angle_layers(block, inputs)
+        with self.sums.timed("kernel"):
+            result = self.corrector(inputs, first_row=block.row, want_removed="removed" in self._products)
+        layers |= {"corrected": result.corrected, "flags": result.flags[None]}
+        if result.removed is not None:
+            layers["removed"] = result.removed
+        with self.sums.timed("write"):
+            for name, writer in self.writers.items():
+                writer.write(block, layers[name])
+        self.sums.add(result, skipped)
+        return rows.size
+
+    def inputs(self, block: Block, image: Array, rows: Array, needed: Array) -> BlockInputs:
+        """Directions and masks of a block; nothing of it is computed where no material has a peak."""
+        scene = self.scene
+        if not needed.any() and "angles" not in self._products:
+            up = np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1)
+            return BlockInputs(image=image, material=rows, sun=up, view=up, normal=up)
+        sun = scene.sun.vectors(block)
+        normal, unreliable = self.ground.surface.normals(block)
+        view = scene.view.vectors(scene.grid, block, self.ground.surface.heights(block))
+        return BlockInputs(
+            image=image,
+            material=rows,
+            sun=sun,
+            view=view,
+            normal=normal,
+            shadowed=self._shadowed(block, image, rows, needed, sun, normal),
+            hidden=self.ground.hidden(block, needed) if needed.any() else None,
+            unreliable=unreliable,
+        )
+
+    def _shadowed(
+        self, block: Block, image: Array, rows: Array, needed: Array, sun: Array, normal: Array
+    ) -> Array | None:
+        """Where the sun is hidden: as the surface model says, and at the rim of a shadow as the image says."""
+        found = self.ground.shadowed(block) if needed.any() else None
+        if found is None:
+            return None
+        shadowed, unsure = found
+        return self._by_brightness.settle(shadowed, unsure & needed, image, rows, sun, normal)
+
+    def _angle_layers(self, block: Block, inputs: BlockInputs) -> dict[str, Array]:
+        """The layers of angles and widths that are asked for, float32."""
+        layers: dict[str, Array] = {}
+        if "azimuthal_width" in self._products:
+            layers["azimuthal_width"] = self._azimuthal_width(inputs)[None]
+        if "angles" in self._products:
+            angles = facet_angles(inputs.sun, inputs.view, inputs.normal)
+            convergence = self.scene.sun.convergence_deg
+            for name, vectors in (("solar", inputs.sun), ("view", inputs.view)):
+                zenith, azimuth = zenith_azimuth(vectors)
+                angles |= {f"{name}_zenith": zenith, f"{name}_azimuth": true_azimuth(azimuth, convergence)}
+            layers["angles"] = np.stack(
+                [np.broadcast_to(angles[name], block.shape).astype(np.float32) for name in ANGLE_NAMES]
+            )
+        return layers
+
+    def _azimuthal_width(self, inputs: BlockInputs) -> Array:
+        """Azimuthal width of the peak for the material and incidence of each pixel, nan where none. [deg]"""
+        rows = inputs.material
+        widths = np.full(rows.shape, np.nan, np.float32)
+        if self.corrector.peaks[rows].any():
+            incidence = np.broadcast_to(angle_between(inputs.sun, inputs.normal), rows.shape)
+            for row, table in enumerate(self._tables, start=1):
+                mine = rows == row
+                if table is not None and mine.any():
+                    widths[mine] = table.at(incidence[mine])
+        return widths
+
+    def _writer(self, name: str) -> rasters.Writer:
+        image, stored = self.scene.image, self.scene.stored
+        tags = {"TSCORR_VERSION": __version__, "TSCORR_SCENE": self.scene.name, "TSCORR_PRODUCT": name}
+        profile = dict(image.profile)
+        if (codec := self.scene.config.output.compression) is not None:
+            profile["compress"] = codec
+        like_image = rasters.Layer(
+            names=image.names,
+            dtype=image.dtype.name,
+            nodata=stored.nodata,
+            scales=image.scales,
+            offsets=image.offsets,
+            of_image=True,
+            tags=tags,
+        )
+        angles = rasters.Layer(
+            names=ANGLE_NAMES, dtype="float32", nodata=float("nan"), units=("degree",) * 9, tags=tags
+        )
+        layers = {
+            "corrected": like_image,
+            "removed": replace(like_image, nodata=None, offsets=(0.0,) * image.bands),
+            "flags": rasters.Layer(names=("flags",), dtype="uint16", tags={**tags, **FLAG_TAGS}),
+            "azimuthal_width": replace(angles, names=("azimuthal width",), units=("degree",)),
+            "angles": angles,
+        }
+        if name not in {"corrected", "removed"} and profile.get("compress") in {None, "none"}:
+            profile["compress"] = "deflate"
+        return rasters.Writer(self.folder / f"{name}.tif", profile, image, layers[name])
+
+
+FLAG_TAGS = {f"FLAG_BIT_{flag.value.bit_length() - 1}": str(flag.name) for flag in SINGLE_FLAGS} | {
+    "FLAG_BITS_6_7": "SPECULAR_STATE: 0 negligible, 1 corrected, 2 uncorrectable, 3 not assessed"
+}
+
+
+def workers_of(scene: Scene) -> int:
+    """Threads that work on blocks: as configured, or all cores up to a few."""
+    return scene.config.run.workers or min(MOST_WORKERS, len(os.sched_getaffinity(0)))
+
+
+def run_all(work: Callable[[Block], int], todo: list[Block], workers: int, progress: Progress) -> None:
+    """Call `work` for every block in a bounded queue; the first exception is raised once the rest stopped."""
+    waiting = iter(todo)
+    with ThreadPoolExecutor(workers) as pool:
+        running: set[Future[int]] = set()
+        try:
+            for block in waiting:
+                running.add(pool.submit(work, block))
+                if len(running) > workers:
+                    running = _finish_some(running, progress)
+            while running:
+                running = _finish_some(running, progress)
+        except BaseException:
+            for future in running:
+                future.cancel()
+            raise
+
+
+def _finish_some(running: set[Future[int]], progress: Progress) -> set[Future[int]]:
+    done, rest = wait(running, return_when=FIRST_COMPLETED)
+    for future in done:
+        progress(future.result())
+    return rest
