@@ -45,12 +45,10 @@ A6, A7, A8 = np.float32(0.009950104), np.float32(-0.006363017), np.float32(0.002
 # 2^x over [-1/2, 1/2]; largest relative error 2e-9
 E1, E2, E3 = np.float32(0.6931472), np.float32(0.24022646), np.float32(0.05550329)
 E4, E5, E6 = np.float32(0.00961852), np.float32(0.001339986), np.float32(0.00015337576)
-LOG2_E = np.float32(1.4426950408889634)
+MINUS_LOG2_E = np.float32(-1.4426950408889634)
 TWO_TO_32 = 4294967296.0
 BOUND_MARGIN = np.float32(0.999)
 """a chunk is skipped where its bound is below this part of the threshold: room for rounding"""
-EIGHTH = np.float32(0.125)
-COSINE_STEPS = np.int32(65536)
 LOWEST_EXPONENT = np.float32(-126)  # of a normal float32; below, exp is 0
 
 
@@ -75,12 +73,12 @@ class MaterialTable(NamedTuple):
     """(m,)"""
     fresnel_exact: Any
     """bool (m, bands): the polynomial misses its bound, take `fresnel`"""
-    fresnel_rises: Any
-    """bool (m, bands): F rises with the local angle"""
     shared: Any
     """bool (m, bands): w, n and k are those of the band before"""
-    gain_bound: Any
-    """(m, bands): the largest gain of a band and of those after it that share its lobe"""
+    bound: Any
+    """(m,): no band's pi beta t1 F is larger"""
+    one_w: Any
+    """bool (m,): all bands have the same w"""
     simplified: Any
     """bool (m,): without G"""
     horizontal: Any
@@ -220,23 +218,25 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
 
     real = sun.dtype
     present = np.zeros(materials, np.bool_)
-    kind = np.zeros(CHUNK, np.int32)
-    missing = np.zeros(CHUNK, np.int32)
-    full = np.zeros(CHUNK, np.int32)
     sun_lines, view_lines = np.zeros((3, CHUNK), real), np.zeros((3, CHUNK), real)
     normal_lines = np.zeros((3, CHUNK), real)
     for c in range(3 if rows * cols > 0 else 0):
         sun_lines[c], view_lines[c], normal_lines[c] = sun[c, 0, 0], view[c, 0, 0], normal[c, 0, 0]
-    cos_i, cos_r, cos_l = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    one_minus_cos, alpha2 = np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    shape, lobe, exponential = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    amount = np.zeros((bands, CHUNK), real)
-    share = np.zeros(CHUNK, real)
+    kind, missing, full = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
+    assess, hit, over = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
+    state, clipped = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
+    simplified, horizontal = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
+    policy = np.zeros(CHUNK, np.int32)
     power_bits = np.zeros(CHUNK, np.int32)
     power = power_bits.view(np.float32)
-    assess = np.zeros(CHUNK, np.int32)
-    state = np.zeros(CHUNK, np.int32)
-    hit, over = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
+    cos_i, cos_r, cos_l = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
+    one_minus_cos, alpha2 = np.zeros(CHUNK, real), np.zeros(CHUNK, real)
+    cos_min, cos_max = np.zeros(CHUNK, real), np.zeros(CHUNK, real)
+    negligible, limit = np.zeros(CHUNK, real), np.zeros(CHUNK, real)
+    peak = np.zeros(CHUNK, real)
+    shape, w2, exponential = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
+    lobe, share = np.zeros(CHUNK, real), np.zeros(CHUNK, real)
+    amount = np.zeros((bands, CHUNK), real)
 
     for row in range(rows):
         for start in range(0, cols, CHUNK):
@@ -266,21 +266,20 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
             for q in range(materials):
                 if not present[q]:
                     continue
-                peak = table.peak[q]
-                any_peak |= peak
-                known = ON_ENTRY if peak else QUALITY
-                state_0 = NO_MATERIAL | NOT_ASSESSED if q == 0 else NO_FLAG
+                any_peak |= table.peak[q]
+                known = ON_ENTRY if table.peak[q] else QUALITY
+                none = NO_MATERIAL | NOT_ASSESSED if q == 0 else NO_FLAG
                 q32 = np.int32(q)
                 pixels, gaps = 0, 0
                 for j in range(count):
                     mine, gap = kind[j] == q32, missing[j] != 0
-                    f = (marks[j] & known) | state_0 | (SATURATED if full[j] != 0 else NO_FLAG)
+                    f = (marks[j] & known) | none | (SATURATED if full[j] != 0 else NO_FLAG)
                     f = (marks[j] & QUALITY) | NODATA | NOT_ASSESSED if gap else f
                     marks[j] = f if mine else marks[j]
                     pixels += np.int32(mine)
                     gaps += np.int32(mine & gap)
                 tally.states[q, 3] += pixels if q == 0 else gaps
-                if not peak and q > 0:
+                if not table.peak[q] and q > 0:
                     tally.states[q, 0] += pixels - gaps
             if not any_peak:
                 continue
@@ -300,116 +299,127 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
                 length = math.sqrt(hx * hx + hy * hy + hz * hz)
                 inverse = ONE / length
                 dx, dy, dz = nx[j] - hx * inverse, ny[j] - hy * inverse, nz[j] - hz * inverse
-                u = (dx * dx + dy * dy + dz * dz) * HALF
+                one_minus_cos[j] = (dx * dx + dy * dy + dz * dz) * HALF
                 cos_i[j] = nx[j] * sx[j] + ny[j] * sy[j] + nz[j] * sz[j]
                 cos_r[j] = nx[j] * vx[j] + ny[j] * vy[j] + nz[j] * vz[j]
                 cos_l[j] = length * HALF
-                one_minus_cos[j] = u
             for j in range(count):
                 u = one_minus_cos[j]
                 high = (((A8 * u + A7) * u + A6) * u + A5) * u + A4
                 alpha2[j] = ((((high * u + A3) * u + A2) * u + A1) * u + A0) * u
 
+            # The rules of the material of each pixel.
+            for j in range(count):
+                assess[j] = 0
             for q in range(1, materials):
-                if not (present[q] and table.peak[q]):
-                    continue
-
-                # Which of its pixels can be assessed.
-                cos_min, cos_max, q32 = table.cos_min[q], table.cos_max[q], np.int32(q)
-                assessed, refused = 0, 0
-                for j in range(count):
-                    f = marks[j]
-                    least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
-                    most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
-                    mine = (kind[j] == q32) & (missing[j] == 0)
-                    lit, seen = cos_i[j] > ZERO, cos_r[j] > ZERO
-                    steep = (least >= cos_min) & (most <= cos_max)
-                    open_ = lit & seen & steep & ((f & HIDDEN) == 0)
-                    assess[j] = np.int32(mine & open_)
-                    f |= NO_FLAG if open_ else NOT_ASSESSED
-                    f |= NO_FLAG if lit else SELF_SHADOW
-                    f |= NO_FLAG if seen else NOT_VIEWED
-                    f |= GRAZING if lit & seen & (not steep) else NO_FLAG
-                    marks[j] = f if mine else marks[j]
-                    assessed += np.int32(mine & open_)
-                    refused += np.int32(mine & (not open_))
-                tally.states[q, 3] += refused
-                if assessed == 0:
-                    continue
-
-                # G / (cos_i cos_r), on the plane that R refers to; finite at grazing angles.
-                simplified, horizontal = table.simplified[q], table.horizontal[q]
-                attenuated = 0
-                for j in range(count):
-                    good = assess[j] != 0
-                    least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
-                    most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
-                    total = cos_i[j] + cos_r[j]
-                    c2 = cos_l[j] * cos_l[j]
-                    inside = least * total >= c2
-                    attenuated += np.int32(good & (not inside))
-                    whole = simplified | inside
-                    numerator = ONE if whole else total
-                    denominator = cos_i[j] * cos_r[j] if whole else most * c2
-                    numerator = numerator * cos_i[j] if horizontal else numerator
-                    denominator = denominator * sz[j] if horizontal else denominator
-                    shape[j] = (numerator if good else ZERO) / (denominator if good else ONE)
-                tally.attenuated[0] += attenuated
-
-                # Is the whole chunk provably out of the lobe? F at its largest local angle bounds F, and
-                # exp(-x) <= (1 + y + y^2/2)^-8 with y = x/8 bounds the exponential.
-                if skip:
-                    least = COSINE_STEPS
+                if present[q] and table.peak[q]:
+                    low, high, q32 = table.cos_min[q], table.cos_max[q], np.int32(q)
+                    threshold, most, bound = table.negligible[q], table.share[q], table.bound[q]
+                    is_simplified, is_horizontal = np.int32(table.simplified[q]), np.int32(table.horizontal[q])
+                    what = np.int32(table.policy[q])
                     for j in range(count):
-                        x = np.int32(cos_l[j] * real.type(COSINE_STEPS)) if assess[j] != 0 else COSINE_STEPS
-                        least = x if x < least else least
-                    inside = np.int32(0)
-                    for b in range(bands):
-                        if not table.shared[q, b]:
-                            f = fresnel(np.float64(least) / COSINE_STEPS, table.n[q, b], table.k[q, b])
-                            f = f if table.fresnel_rises[q, b] else 1.0
-                            peak = real.type(np.float64(table.gain_bound[q, b]) * f)
-                            eighth = table.w2[q, b] * EIGHTH
-                            threshold = table.negligible[q] * BOUND_MARGIN
-                            for j in range(count):
-                                y = eighth * alpha2[j]
-                                x = peak * shape[j]
-                                y = ONE + y + HALF * y * y
-                                y *= y
-                                y *= y
-                                inside |= np.int32(x >= threshold * y * y)
-                    if inside == 0:
-                        tally.states[q, 0] += assessed
-                        tally.out_of_lobe[0] += assessed
-                        if (first_row + row) % stride == 0:
-                            _tally_geometry(tally, q, count, assess, cos_i, alpha2)
-                        continue
+                        mine = kind[j] == q32
+                        assess[j] |= np.int32(mine & (missing[j] == 0))
+                        cos_min[j] = low if mine else cos_min[j]
+                        cos_max[j] = high if mine else cos_max[j]
+                        negligible[j] = threshold if mine else negligible[j]
+                        limit[j] = most if mine else limit[j]
+                        peak[j] = bound if mine else peak[j]
+                    for j in range(count):
+                        mine = kind[j] == q32
+                        simplified[j] = is_simplified if mine else simplified[j]
+                        horizontal[j] = is_horizontal if mine else horizontal[j]
+                        policy[j] = what if mine else policy[j]
 
-                # The lobe of each band; bands with the same w, n, k share it.
-                for b in range(bands):
-                    if not table.shared[q, b] and exact:
+            # Which pixels can be assessed.
+            for j in range(count):
+                f = marks[j]
+                least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
+                most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
+                wanted = assess[j] != 0
+                lit, seen = cos_i[j] > ZERO, cos_r[j] > ZERO
+                steep = (least >= cos_min[j]) & (most <= cos_max[j])
+                free = lit & seen & steep & ((f & HIDDEN) == 0)
+                assess[j] = np.int32(wanted & free)
+                f |= NO_FLAG if free else NOT_ASSESSED
+                f |= NO_FLAG if lit else SELF_SHADOW
+                f |= NO_FLAG if seen else NOT_VIEWED
+                f |= GRAZING if lit & seen & (not steep) else NO_FLAG
+                marks[j] = f if wanted else marks[j]
+            total_assessed = 0
+            for j in range(count):
+                total_assessed += assess[j]
+            if total_assessed == 0:
+                _count_states(tally, table, present, kind, missing, assess, state, count)
+                continue
+
+            # G / (cos_i cos_r), on the plane that R refers to; finite at grazing angles.
+            attenuated = 0
+            for j in range(count):
+                good = assess[j] != 0
+                least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
+                most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
+                total = cos_i[j] + cos_r[j]
+                c2 = cos_l[j] * cos_l[j]
+                inside = least * total >= c2
+                attenuated += np.int32(good & (not inside))
+                whole = (simplified[j] != 0) | inside
+                numerator = ONE if whole else total
+                denominator = cos_i[j] * cos_r[j] if whole else most * c2
+                on_level = horizontal[j] != 0
+                numerator = numerator * (cos_i[j] if on_level else ONE)
+                denominator = denominator * (sz[j] if on_level else ONE)
+                shape[j] = (numerator if good else ZERO) / (denominator if good else ONE)
+            tally.attenuated[0] += attenuated
+
+            # The lobe of each band; bands with the same w, n, k share it.
+            may_skip, outside = skip and not exact, False
+            for q in range(1, materials):
+                may_skip &= not (present[q] and table.peak[q]) or table.one_w[q]
+            for b in range(bands):
+                again = b == 0
+                for q in range(1, materials):
+                    again |= present[q] and table.peak[q] and not table.shared[q, b]
+                if again and exact:
+                    for j in range(count):
+                        lobe[j] = ZERO
+                        if assess[j] != 0:
+                            q = kind[j]
+                            angles = geometry((sx[j], sy[j], sz[j]), (vx[j], vy[j], vz[j]), (nx[j], ny[j], nz[j]))
+                            f = specular(angles, table.w[q, b], table.n[q, b], table.k[q, b], simplified[j] != 0)
+                            lobe[j] = f * cos_i[j] / sz[j] if horizontal[j] != 0 else f
+                elif again:
+                    for q in range(1, materials):
+                        if present[q] and table.peak[q]:
+                            part, q32 = table.w2[q, b], np.int32(q)
+                            for j in range(count):
+                                w2[j] = part if kind[j] == q32 else w2[j]
+                    for j in range(count):
+                        x = w2[j] * alpha2[j] * MINUS_LOG2_E
+                        x = x if x > LOWEST_EXPONENT else LOWEST_EXPONENT
+                        integer = np.int32(x - HALF)  # x <= 0: rounds to the nearest
+                        power_bits[j] = (integer + np.int32(127)) << np.int32(23)
+                        exponential[j] = x - np.float32(integer)
+                    for j in range(count):
+                        x = exponential[j]
+                        p = (((((E6 * x + E5) * x + E4) * x + E3) * x + E2) * x + E1) * x + ONE
+                        exponential[j] = p * power[j] * shape[j]
+                    if may_skip and b == 0:
+                        inside_lobe = np.int32(0)
                         for j in range(count):
-                            lobe[j] = ZERO
-                            if assess[j] != 0:
-                                angles = geometry((sx[j], sy[j], sz[j]), (vx[j], vy[j], vz[j]), (nx[j], ny[j], nz[j]))
-                                f = specular(angles, table.w[q, b], table.n[q, b], table.k[q, b], simplified)
-                                lobe[j] = f * cos_i[j] / sz[j] if horizontal else f
-                    elif not table.shared[q, b]:
-                        minus_w2 = -table.w2[q, b] * LOG2_E
-                        for j in range(count):
-                            x = minus_w2 * alpha2[j]
-                            x = x if x > LOWEST_EXPONENT else LOWEST_EXPONENT
-                            integer = np.int32(x - HALF)  # x <= 0: rounds to the nearest
-                            power_bits[j] = (integer + np.int32(127)) << np.int32(23)
-                            exponential[j] = x - np.float32(integer)
-                        for j in range(count):
-                            x = exponential[j]
-                            p = (((((E6 * x + E5) * x + E4) * x + E3) * x + E2) * x + E1) * x + ONE
-                            exponential[j] = p * power[j]
+                            inside_lobe |= np.int32(peak[j] * exponential[j] >= negligible[j] * BOUND_MARGIN)
+                        if inside_lobe == 0:
+                            outside = True
+                            break
+                    for q in range(1, materials):
+                        if not (present[q] and table.peak[q]):
+                            continue
+                        q32 = np.int32(q)
                         if table.fresnel_exact[q, b]:
                             for j in range(count):
-                                f = fresnel(np.float64(cos_l[j]), table.n[q, b], table.k[q, b])
-                                lobe[j] = f * shape[j] * exponential[j]
+                                if kind[j] == q32:
+                                    f = fresnel(np.float64(cos_l[j]), table.n[q, b], table.k[q, b])
+                                    lobe[j] = f * exponential[j]
                         else:
                             scale, shift = table.fresnel_scale[q], table.fresnel_shift[q]
                             c = table.fresnel[q, b]
@@ -417,103 +427,130 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
                             f7, f8, f9, f10, f11, f12 = c[7], c[8], c[9], c[10], c[11], c[12]
                             for j in range(count):
                                 x = cos_l[j] * scale + shift
-                                high = (((((f12 * x + f11) * x + f10) * x + f9) * x + f8) * x + f7) * x + f6
-                                low = (((((high * x + f5) * x + f4) * x + f3) * x + f2) * x + f1) * x + f0
-                                lobe[j] = low * shape[j] * exponential[j]
-                    gain, amounts = table.gain[q, b], amount[b]
-                    for j in range(count):
-                        amounts[j] = gain * lobe[j]
-
-                # What becomes of each pixel.
-                negligible, limit = table.negligible[q], table.share[q]
-                for j in range(count):
-                    hit[j] = 0
-                    over[j] = full[j]
-                    share[j] = ZERO
-                for b in range(bands):
-                    scale, offset = rules.scale[b], rules.offset[b]
-                    values, amounts = image[b, row, start:stop], amount[b]
-                    for j in range(count):
-                        a = amounts[j]
-                        above = (assess[j] != 0) & (a >= negligible)
-                        r = real.type(values[j]) * scale + offset
-                        part = a / (r if r > ZERO else ONE)
-                        part = part if r > ZERO else TWO
-                        part = part if above else ZERO
-                        share[j] = part if part > share[j] else share[j]
-                        amounts[j] = a if above else ZERO
-                        hit[j] |= np.int32(above)
-                        over[j] |= np.int32(above & (part > limit))
-                hits, uncorrectable = 0, 0
-                for j in range(count):
-                    over[j] &= hit[j]
-                    state[j] = hit[j] + over[j]
-                    hits += hit[j]
-                    uncorrectable += over[j]
-                tally.states[q, 0] += assessed - hits
-                tally.states[q, 1] += hits - uncorrectable
-                tally.states[q, 2] += uncorrectable
-
-                if hits > 0:
-                    policy, dodges = table.policy[q], rules.dodge
-                    best = policy == BEST
-                    for j in range(count):
-                        marks[j] |= np.uint16(state[j] << np.int32(6))
-                        over[j] = 0
-                    for b in range(bands):
-                        steps, lowest, saturation = rules.steps[b], rules.lowest[b], rules.saturation[b]
-                        values, amounts = image[b, row, start:stop], amount[b]
-                        nodata = real.type(rules.nodata[0])
-                        if rules.integer:
-                            for j in range(count):
-                                whole = np.int32(amounts[j] * steps + HALF)
-                                exponential[j] = real.type(whole)
-                        else:
-                            for j in range(count):
-                                exponential[j] = amounts[j] * steps
+                                f = (((((f12 * x + f11) * x + f10) * x + f9) * x + f8) * x + f7) * x + f6
+                                f = (((((f * x + f5) * x + f4) * x + f3) * x + f2) * x + f1) * x + f0
+                                lobe[j] = f * exponential[j] if kind[j] == q32 else lobe[j]
+                amounts = amount[b]
+                for q in range(1, materials):
+                    if present[q] and table.peak[q]:
+                        gain, q32 = table.gain[q, b], np.int32(q)
                         for j in range(count):
-                            value = real.type(values[j])
-                            new = value - exponential[j]
-                            low = new < lowest
-                            floor = lowest if lowest < value else value
-                            new = floor if low else new
-                            dodge = dodges & (new == nodata)
-                            new = new + ONE if dodge else new
-                            take = (amounts[j] > ZERO) & (value < saturation)
-                            take = take & ((state[j] == 1) | best)
-                            over[j] |= np.int32(take & (low | dodge))
-                            new = new if take else value
-                            exponential[j] = new
-                            amounts[j] = value - new
-                        if rules.integer:
-                            for j in range(count):
-                                values[j] = np.int32(exponential[j])
-                        else:
-                            for j in range(count):
-                                values[j] = exponential[j]
-                        if want_removed:
-                            taken = removed[b, row, start:stop]
-                            for j in range(count):
-                                taken[j] = amounts[j] if hit[j] != 0 else taken[j]
-                    for j in range(count):
-                        marks[j] |= np.uint16(over[j]) * CLIPPED
-                    if policy == BLANK and uncorrectable > 0:
-                        for b in range(bands):
-                            for j in range(count):
-                                if state[j] == 2:
-                                    image[b, row, start + j] = rules.nodata[0]
+                            amounts[j] = gain * lobe[j] if kind[j] == q32 else amounts[j]
 
+            if outside:
+                for j in range(count):
+                    state[j] = 0
+                tally.out_of_lobe[0] += total_assessed
+                _count_states(tally, table, present, kind, missing, assess, state, count)
                 if (first_row + row) % stride == 0:
-                    _tally_geometry(tally, q, count, assess, cos_i, alpha2)
-                    if hits > 0:
-                        _tally_removed(tally, rules, q, count, hit, share, amount, cos_i, cos_r, cos_l, simplified)
+                    _tally_geometry(tally, count, kind, assess, cos_i, alpha2)
+                continue
+
+            # What becomes of each pixel.
+            for j in range(count):
+                hit[j] = 0
+                over[j] = full[j]
+                share[j] = ZERO
+            for b in range(bands):
+                scale, offset = rules.scale[b], rules.offset[b]
+                values, amounts = image[b, row, start:stop], amount[b]
+                for j in range(count):
+                    a = amounts[j]
+                    above = (assess[j] != 0) & (a >= negligible[j])
+                    r = real.type(values[j]) * scale + offset
+                    bright = r > ZERO
+                    part = (a if bright else TWO) / (r if bright else ONE)
+                    part = part if above else ZERO
+                    share[j] = part if part > share[j] else share[j]
+                    amounts[j] = a if above else ZERO
+                    hit[j] |= np.int32(above)
+                    over[j] |= np.int32(above & (part > limit[j]))
+            hits, blanks = 0, 0
+            for j in range(count):
+                over[j] &= hit[j]
+                state[j] = hit[j] + over[j]
+                clipped[j] = 0
+                hits += hit[j]
+                blanks += np.int32((over[j] != 0) & (policy[j] == BLANK))
+            _count_states(tally, table, present, kind, missing, assess, state, count)
+
+            if hits > 0:
+                for b in range(bands):
+                    steps, lowest, saturation = rules.steps[b], rules.lowest[b], rules.saturation[b]
+                    values, amounts = image[b, row, start:stop], amount[b]
+                    nodata, dodges = real.type(rules.nodata[0]), rules.dodge
+                    if rules.integer:
+                        for j in range(count):
+                            exponential[j] = real.type(np.int32(amounts[j] * steps + HALF))
+                    else:
+                        for j in range(count):
+                            exponential[j] = amounts[j] * steps
+                    for j in range(count):
+                        value = real.type(values[j])
+                        new = value - exponential[j]
+                        low = new < lowest
+                        floor = lowest if lowest < value else value
+                        new = floor if low else new
+                        dodge = dodges & (new == nodata)
+                        new = new + ONE if dodge else new
+                        take = (amounts[j] > ZERO) & (value < saturation)
+                        take = take & ((state[j] == 1) | (policy[j] == BEST))
+                        clipped[j] |= np.int32(take & (low | dodge))
+                        new = new if take else value
+                        exponential[j] = new
+                        amounts[j] = value - new
+                    if rules.integer:
+                        for j in range(count):
+                            values[j] = np.int32(exponential[j])
+                    else:
+                        for j in range(count):
+                            values[j] = exponential[j]
+                    if want_removed:
+                        taken = removed[b, row, start:stop]
+                        for j in range(count):
+                            taken[j] = amounts[j] if hit[j] != 0 else taken[j]
+                for j in range(count):
+                    f = marks[j] | (CLIPPED if clipped[j] != 0 else NO_FLAG)
+                    f |= CORRECTED if state[j] == 1 else NO_FLAG
+                    marks[j] = f | (UNCORRECTABLE if state[j] == 2 else NO_FLAG)
+                if blanks > 0:
+                    for b in range(bands):
+                        for j in range(count):
+                            if state[j] == 2 and policy[j] == BLANK:
+                                image[b, row, start + j] = rules.nodata[0]
+
+            if (first_row + row) % stride == 0:
+                _tally_geometry(tally, count, kind, assess, cos_i, alpha2)
+                if hits > 0:
+                    _tally_removed(tally, rules, count, kind, hit, share, amount, cos_i, cos_r, cos_l, simplified)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tally_geometry(tally, q, count, assess, cos_i, alpha2):
+def _count_states(tally, table, present, kind, missing, assess, state, count):
+    """Pixels of a chunk by material and state, for the materials with a peak."""
+    for q in range(1, present.size):
+        if present[q] and table.peak[q]:
+            q32 = np.int32(q)
+            negligible, corrected, uncorrectable, refused = 0, 0, 0, 0
+            for j in range(count):
+                mine = (kind[j] == q32) & (missing[j] == 0)
+                done = mine & (assess[j] != 0)
+                refused += np.int32(mine & (assess[j] == 0))
+                negligible += np.int32(done & (state[j] == 0))
+                corrected += np.int32(done & (state[j] == 1))
+                uncorrectable += np.int32(done & (state[j] == 2))
+            tally.states[q, 0] += negligible
+            tally.states[q, 1] += corrected
+            tally.states[q, 2] += uncorrectable
+            tally.states[q, 3] += refused
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tally_geometry(tally, count, kind, assess, cos_i, alpha2):
     """Histograms of the angle of incidence and of the facet tilt over the assessed pixels of a chunk."""
     for j in range(count):
         if assess[j] != 0:
+            q = kind[j]
             incidence = math.acos(min(1.0, np.float64(cos_i[j]))) * DEG_PER_RAD
             tilt = math.sqrt(np.float64(alpha2[j])) * DEG_PER_RAD
             tally.incidence[q, min(359, int(incidence * 4))] += 1
@@ -522,10 +559,11 @@ def _tally_geometry(tally, q, count, assess, cos_i, alpha2):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tally_removed(tally, rules, q, count, hit, share, amount, cos_i, cos_r, cos_l, simplified):
+def _tally_removed(tally, rules, count, kind, hit, share, amount, cos_i, cos_r, cos_l, simplified):
     """Share, removed reflectance and the difference that G makes, over the pixels inside the lobe."""
     for j in range(count):
         if hit[j] != 0:
+            q = kind[j]
             part = min(1.0, np.float64(share[j]))
             tally.share[q, int(part * 200)] += 1
             tally.extremes[q, 1] = max(tally.extremes[q, 1], part)
@@ -533,5 +571,5 @@ def _tally_removed(tally, rules, q, count, hit, share, amount, cos_i, cos_r, cos
                 taken = np.float64(amount[b, j]) * np.float64(rules.scale[b])
                 tally.removed[q, b] += np.int64(taken * TWO_TO_32 + 0.5)
             g = attenuation(np.float64(cos_i[j]), np.float64(cos_r[j]), np.float64(cos_l[j]))
-            change = 1 - g if simplified else 1 / g - 1
+            change = 1 - g if simplified[j] != 0 else 1 / g - 1
             tally.attenuated[1] = max(tally.attenuated[1], part * change)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tscorr import kernels, reference
 from tscorr.correction.flags import PixelFlag
 from tscorr.correction.rules import Stored
-from tscorr.correction.tables import Entry, material_table, new_tally, pixel_rules
+from tscorr.correction.tables import Entry, computed_precision, material_table, new_tally, pixel_rules
 from tscorr.errors import InputError
 
 Array = NDArray[Any]
@@ -91,14 +91,14 @@ class Corrector:
         self.skip = skip
         self.tally_stride = tally_stride
         self._pixels = pixel_rules(stored)
-        precisions = [rules.precision for *_, rules in materials]
+        precisions = [computed_precision(*entry) for entry in materials]
         self._engines = [
-            self._engine(precision, materials, stored) for precision in sorted(set(precisions)) or ["fast"]
+            self._engine(precision, np.array([False, *(own == precision for own in precisions)]), materials, stored)
+            for precision in sorted(set(precisions)) or ["fast"]
         ]
 
     @staticmethod
-    def _engine(precision: str, materials: Sequence[Entry], stored: Stored) -> _Engine:
-        mine = np.array([False, *(rules.precision == precision for *_, rules in materials)])
+    def _engine(precision: str, mine: Array, materials: Sequence[Entry], stored: Stored) -> _Engine:
         real = np.float32 if precision == "fast" else np.float64
         table = material_table(materials, len(stored.scale), real)
         return _Engine(precision, table._replace(peak=table.peak & mine), mine)

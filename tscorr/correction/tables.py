@@ -48,6 +48,21 @@ def pixel_rules(stored: Stored) -> dict[np.dtype[Any], kernels.PixelRules]:
     }
 
 
+def computed_precision(surface: Material, parameters: BandParameters, rules: Rules) -> str:
+    """The precision of the rules, but "exact" where float32 cannot keep the promise of "fast".
+
+    A direction in float32 is unsure by about 1e-7, the facet tilt by 1 / cos theta_l times as much, since sun and
+    view nearly cancel at grazing angles, and a narrow lobe turns that into reflectance in proportion to w.
+    Where all light is reflected beyond a critical angle (n < 1, hardly absorbing), F has a kink there.
+    The limits are searched: see `tscorr bench`, which fails where "fast" errs by more than it says.
+    """
+    if rules.precision != "fast":
+        return rules.precision
+    narrow = parameters.w * (2 + 1 / _cosine(_steepest(surface, rules))) > 1
+    kinked = (parameters.n < 1) & (parameters.k < 0.05)
+    return "exact" if np.any((parameters.t1 > 0) & (narrow | kinked)) else "fast"
+
+
 def material_table(materials: Sequence[Entry], bands: int, real: type[np.floating[Any]]) -> kernels.MaterialTable:
     """Materials and their rules as arrays of one float type; row 0 is "no material"."""
     rows = [_material_row(*entry, bands) for entry in materials]
@@ -63,18 +78,12 @@ def material_table(materials: Sequence[Entry], bands: int, real: type[np.floatin
 def _material_row(surface: Material, parameters: BandParameters, rules: Rules, bands: int) -> dict[str, Any]:
     beta = np.broadcast_to(np.array(rules.direct_fraction, dtype=float), bands)
     gain = np.pi * beta * parameters.t1
-    low, high = surface.zenith_range_deg
-    limit = MAX_ZENITH_DEG[rules.form] if rules.max_zenith_deg is None else rules.max_zenith_deg
-    steepest = min(high, limit)
+    low, steepest = surface.zenith_range_deg[0], _steepest(surface, rules)
     shared = np.zeros(bands, bool)
     for key in ("w", "n", "k"):
         values = getattr(parameters, key)
         shared[1:] |= values[1:] != values[:-1]
     shared = ~shared & (np.arange(bands) > 0)
-    gain_bound = gain.copy()
-    for band in range(bands - 2, -1, -1):
-        if shared[band + 1]:
-            gain_bound[band] = max(gain_bound[band], gain_bound[band + 1])
     fits = [fresnel_polynomial(n, k, steepest) for n, k in zip(parameters.n, parameters.k, strict=True)]
     cos_steepest = _cosine(steepest)
     return {
@@ -88,9 +97,9 @@ def _material_row(surface: Material, parameters: BandParameters, rules: Rules, b
         "fresnel_scale": 2 / (1 - cos_steepest),
         "fresnel_shift": -(1 + cos_steepest) / (1 - cos_steepest),
         "fresnel_exact": [error > FRESNEL_ERROR for _, error in fits],
-        "fresnel_rises": _fresnel_rises(parameters.n, parameters.k),
         "shared": shared,
-        "gain_bound": gain_bound,
+        "bound": float(np.max(gain * _fresnel_bound(parameters.n, parameters.k, cos_steepest))),
+        "one_w": bool(np.all(parameters.w == parameters.w[0])),
         "simplified": rules.form == "simplified",
         "horizontal": rules.irradiance_plane == "horizontal",
         "cos_min": cos_steepest,
@@ -101,14 +110,24 @@ def _material_row(surface: Material, parameters: BandParameters, rules: Rules, b
     }
 
 
+def _steepest(surface: Material, rules: Rules) -> float:
+    """The largest incidence and exitance that are assessed. [deg]"""
+    limit = MAX_ZENITH_DEG[rules.form] if rules.max_zenith_deg is None else rules.max_zenith_deg
+    return min(surface.zenith_range_deg[1], limit)
+
+
 def _cosine(zenith_deg: float) -> float:
     return float(np.sin(np.deg2rad(90.0 - zenith_deg)))
 
 
-def _fresnel_rises(n: Array, k: Array) -> Array:
-    """Whether F rises with the local angle all the way: for n >= 1 and F(0) <= 1/3."""
+def _fresnel_bound(n: Array, k: Array, cos_min: float) -> Array:
+    """No F is larger for cosines of the local angle from `cos_min` to 1.
+
+    For n >= 1 and F(0) <= 1/3, F rises with the local angle all the way; others are bounded by 1.
+    """
     normal_incidence = ((n - 1) ** 2 + k**2) / ((n + 1) ** 2 + k**2)
-    return (n >= 1) & (normal_incidence <= 1 / 3)
+    rises = (n >= 1) & (normal_incidence <= 1 / 3)
+    return np.where(rises, reference.fresnel(np.float64(cos_min), n, k), 1.0)  # type: ignore[arg-type]
 
 
 @cache

@@ -3,7 +3,7 @@
 import resource
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from tscorr import __version__, publish, rasters
+from tscorr import __version__, publish, rasters, stac
 from tscorr.angles import relative_azimuth, true_azimuth, zenith_azimuth
 from tscorr.grid import Block, Grid, longitude_latitude
 from tscorr.report import SceneFacts, page, summary, write_json
@@ -65,6 +65,7 @@ def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
         write_json(report, folder / "report.json")
         widths = _decimated_widths(folder)
         (folder / "report.html").write_text(page(report, facts, picture, widths), encoding="utf-8")
+        write_json(stac_item(scene, folder, facts, report), folder / "item.json")
         (folder / "settings.toml").write_text(tomli_w.dumps(settings_of(scene)), encoding="utf-8")
         publication.commit(
             {
@@ -154,6 +155,27 @@ def _bands(scene: Scene, info: rasters.RasterInfo, bands: Iterable[int]) -> Iter
     for band in bands:
         stored = rasters.read_decimated(info, PICTURE_PX, [band + 1])[0]
         yield stored * scene.stored.scale[band] + scene.stored.offset[band]
+
+
+def stac_item(scene: Scene, folder: Path, facts: SceneFacts, report: Mapping[str, Any]) -> dict[str, Any]:
+    """The STAC item of a scene that is being published."""
+    zenith, azimuth = facts.centre_view_deg or (float("nan"), float("nan"))
+    sun = scene.settings.sun
+    return stac.item(
+        name=scene.name,
+        grid=scene.grid,
+        datetime=None if sun is None else sun.time,
+        files={path.stem: rasters.describe(path) for path in sorted(folder.glob("*.tif"))},
+        inputs=scene.inputs,
+        solar_zenith_deg=facts.solar_zenith_deg,
+        solar_azimuth_deg=facts.solar_azimuth_deg,
+        view_zenith_deg=zenith,
+        view_azimuth_deg=azimuth,
+        bands=(scene.image.names, scene.wavelengths_um, scene.image.fwhm_um),
+        report=report,
+        version=__version__,
+        quicklook=scene.config.output.quicklook,
+    )
 
 
 def _decimated_widths(folder: Path) -> Array | None:
