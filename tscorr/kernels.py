@@ -67,12 +67,8 @@ class MaterialTable(NamedTuple):
     k: Any
     """float64 (m, bands): refractive index n - ik"""
     fresnel: Any
-    """(m, bands, FRESNEL_DEGREE + 1): polynomial of F in x = cos_l * fresnel_scale + fresnel_shift"""
-    fresnel_scale: Any
-    fresnel_shift: Any
-    """(m,)"""
-    fresnel_exact: Any
-    """bool (m, bands): the polynomial misses its bound, take `fresnel`"""
+    """(m, bands, FRESNEL_DEGREE + 3): polynomial of F in x = cos_l * scale + shift, lowest power first, then scale and
+    shift; scale is 0 where the polynomial misses its bound and `fresnel` is to be taken"""
     shared: Any
     """bool (m, bands): w, n and k are those of the band before"""
     bound: Any
@@ -193,12 +189,6 @@ def specular(geometry, w, n, k, simplified):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _line(component, constant, row, start, stop):
-    """A piece of a row of one component of a vector field; `constant` where the field is one pixel."""
-    return constant[: stop - start] if component.size == 1 else component[row, start:stop]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def correct_block(image, removed, flags, material, sun, view, normal, table, rules, tally, options):
     """Take the specular part out of a block of an image, in place. Twin of reference.correct_block.
 
@@ -212,341 +202,463 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
     options  : int64 (4,): exact, skip, first row of the block in the image, tally every so many rows.
     """
     bands, rows, cols = image.shape
-    materials = table.peak.size
     exact, skip, first_row, stride = options[0] != 0, options[1] != 0, options[2], options[3]
     want_removed = removed.shape[1] == rows
-
     real = sun.dtype
-    present = np.zeros(materials, np.bool_)
-    sun_lines, view_lines = np.zeros((3, CHUNK), real), np.zeros((3, CHUNK), real)
-    normal_lines = np.zeros((3, CHUNK), real)
-    for c in range(3 if rows * cols > 0 else 0):
-        sun_lines[c], view_lines[c], normal_lines[c] = sun[c, 0, 0], view[c, 0, 0], normal[c, 0, 0]
-    kind, missing, full = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
-    assess, hit, over = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
-    state, clipped = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
+    peak, states = table.peak, tally.states  # taken out of their tuples once: each access costs a reference count
+    cos_min_of, cos_max_of, negligible_of, limit_of = table.cos_min, table.cos_max, table.negligible, table.share
+    bound_of, simplified_of, horizontal_of = table.bound, table.simplified, table.horizontal
+    policy_of, w2_of, gain_of, shared_of, one_w = table.policy, table.w2, table.gain, table.shared, table.one_w
+    fresnel_of, n_of, k_of = table.fresnel, table.n, table.k
+    scale, offset, steps, lowest = rules.scale, rules.offset, rules.steps, rules.lowest
+    saturation, nodata = rules.saturation, rules.nodata
+    has_nodata, dodges, integer = rules.has_nodata, rules.dodge, rules.integer
+
+    present = np.zeros(peak.size, np.bool_)
+    fixed = np.zeros((9, CHUNK), real)
+    kind, missing, saturated = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
+    assess, hit, state = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
+    clipped, policy = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
     simplified, horizontal = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
-    policy = np.zeros(CHUNK, np.int32)
     power_bits = np.zeros(CHUNK, np.int32)
     power = power_bits.view(np.float32)
     cos_i, cos_r, cos_l = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    one_minus_cos, alpha2 = np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    cos_min, cos_max = np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    negligible, limit = np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    peak = np.zeros(CHUNK, real)
+    cos_min, cos_max, alpha2 = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
+    negligible, limit, bound = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
     shape, w2, exponential = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    lobe, share = np.zeros(CHUNK, real), np.zeros(CHUNK, real)
+    lobe, share, new_values = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
     amount = np.zeros((bands, CHUNK), real)
+    if rows * cols > 0:
+        _set_constants(fixed, sun, view, normal)
 
     for row in range(rows):
+        tallied = (first_row + row) % stride == 0
         for start in range(0, cols, CHUNK):
-            count = min(CHUNK, cols - start)
-            stop = start + count
-            marks, line = flags[row, start:stop], material[row, start:stop]
+            stop = min(start + CHUNK, cols)
+            count = stop - start
+            marks = flags[row, start:stop]
 
             # Which materials, and which pixels have data.
-            present[:] = False
-            for j in range(count):
-                present[line[j]] = True
-            for j in range(count):
-                kind[j] = line[j]
-                missing[j] = 0
-                full[j] = 0
+            _clear(missing)
+            _clear(saturated)
             for b in range(bands):
-                saturation, values = rules.saturation[b], image[b, row, start:stop]
-                for j in range(count):
-                    value = np.float32(values[j])
-                    missing[j] |= np.int32(value - value != ZERO)
-                    full[j] |= np.int32(value >= saturation)
-                if rules.has_nodata:
-                    nodata = rules.nodata[0]
-                    for j in range(count):
-                        missing[j] |= np.int32(values[j] == nodata)
+                _look(missing, saturated, image[b, row, start:stop], saturation[b], has_nodata, nodata[0])
+            _list(kind, present, material[row, start:stop])
             any_peak = False
-            for q in range(materials):
-                if not present[q]:
-                    continue
-                any_peak |= table.peak[q]
-                known = ON_ENTRY if table.peak[q] else QUALITY
-                none = NO_MATERIAL | NOT_ASSESSED if q == 0 else NO_FLAG
-                q32 = np.int32(q)
-                pixels, gaps = 0, 0
-                for j in range(count):
-                    mine, gap = kind[j] == q32, missing[j] != 0
-                    f = (marks[j] & known) | none | (SATURATED if full[j] != 0 else NO_FLAG)
-                    f = (marks[j] & QUALITY) | NODATA | NOT_ASSESSED if gap else f
-                    marks[j] = f if mine else marks[j]
-                    pixels += np.int32(mine)
-                    gaps += np.int32(mine & gap)
-                tally.states[q, 3] += pixels if q == 0 else gaps
-                if not table.peak[q] and q > 0:
-                    tally.states[q, 0] += pixels - gaps
+            for q in range(present.size):
+                if present[q]:
+                    _mark(marks, kind, missing, saturated, np.int32(q), peak[q], states)
+                    present[q] = peak[q]
+                    any_peak |= peak[q]
             if not any_peak:
                 continue
 
-            # Directions to cosines: everything about the geometry but the surface's material.
-            sx = _line(sun[0], sun_lines[0], row, start, stop)
-            sy = _line(sun[1], sun_lines[1], row, start, stop)
-            sz = _line(sun[2], sun_lines[2], row, start, stop)
-            vx = _line(view[0], view_lines[0], row, start, stop)
-            vy = _line(view[1], view_lines[1], row, start, stop)
-            vz = _line(view[2], view_lines[2], row, start, stop)
-            nx = _line(normal[0], normal_lines[0], row, start, stop)
-            ny = _line(normal[1], normal_lines[1], row, start, stop)
-            nz = _line(normal[2], normal_lines[2], row, start, stop)
-            for j in range(count):
-                hx, hy, hz = sx[j] + vx[j], sy[j] + vy[j], sz[j] + vz[j]
-                length = math.sqrt(hx * hx + hy * hy + hz * hz)
-                inverse = ONE / length
-                dx, dy, dz = nx[j] - hx * inverse, ny[j] - hy * inverse, nz[j] - hz * inverse
-                one_minus_cos[j] = (dx * dx + dy * dy + dz * dz) * HALF
-                cos_i[j] = nx[j] * sx[j] + ny[j] * sy[j] + nz[j] * sz[j]
-                cos_r[j] = nx[j] * vx[j] + ny[j] * vy[j] + nz[j] * vz[j]
-                cos_l[j] = length * HALF
-            for j in range(count):
-                u = one_minus_cos[j]
-                high = (((A8 * u + A7) * u + A6) * u + A5) * u + A4
-                alpha2[j] = ((((high * u + A3) * u + A2) * u + A1) * u + A0) * u
+            # Everything about the geometry but the surface's material.
+            sx, sy, sz = (
+                _line(sun, fixed, 0, row, start, stop),
+                _line(sun, fixed, 1, row, start, stop),
+                _line(sun, fixed, 2, row, start, stop),
+            )
+            vx, vy, vz = (
+                _line(view, fixed, 3, row, start, stop),
+                _line(view, fixed, 4, row, start, stop),
+                _line(view, fixed, 5, row, start, stop),
+            )
+            nx, ny, nz = (
+                _line(normal, fixed, 6, row, start, stop),
+                _line(normal, fixed, 7, row, start, stop),
+                _line(normal, fixed, 8, row, start, stop),
+            )
+            _cosines(cos_i, cos_r, cos_l, alpha2, sx, sy, sz, vx, vy, vz, nx, ny, nz)
 
-            # The rules of the material of each pixel.
-            for j in range(count):
-                assess[j] = 0
-            for q in range(1, materials):
-                if present[q] and table.peak[q]:
-                    low, high, q32 = table.cos_min[q], table.cos_max[q], np.int32(q)
-                    threshold, most, bound = table.negligible[q], table.share[q], table.bound[q]
-                    is_simplified, is_horizontal = np.int32(table.simplified[q]), np.int32(table.horizontal[q])
-                    what = np.int32(table.policy[q])
-                    for j in range(count):
-                        mine = kind[j] == q32
-                        assess[j] |= np.int32(mine & (missing[j] == 0))
-                        cos_min[j] = low if mine else cos_min[j]
-                        cos_max[j] = high if mine else cos_max[j]
-                        negligible[j] = threshold if mine else negligible[j]
-                        limit[j] = most if mine else limit[j]
-                        peak[j] = bound if mine else peak[j]
-                    for j in range(count):
-                        mine = kind[j] == q32
-                        simplified[j] = is_simplified if mine else simplified[j]
-                        horizontal[j] = is_horizontal if mine else horizontal[j]
-                        policy[j] = what if mine else policy[j]
+            # The rules of each pixel's material, and whether it can be assessed.
+            _clear(assess)
+            for q in range(1, present.size):
+                if present[q]:
+                    q32 = np.int32(q)
+                    _set(cos_min, kind, q32, cos_min_of[q])
+                    _set(cos_max, kind, q32, cos_max_of[q])
+                    _set(negligible, kind, q32, negligible_of[q])
+                    _set(limit, kind, q32, limit_of[q])
+                    _set(bound, kind, q32, bound_of[q])
+                    _set(simplified, kind, q32, np.int32(simplified_of[q]))
+                    _set(horizontal, kind, q32, np.int32(horizontal_of[q]))
+                    _set(policy, kind, q32, np.int32(policy_of[q]))
+                    _want(assess, kind, missing, q32, count)
+            assessed = _assess(assess, cos_min, cos_max, cos_i, cos_r, marks)
+            inside = assessed > 0
+            if inside:
+                tally.attenuated[0] += _set_shape(assess, simplified, horizontal, cos_i, cos_r, cos_l, shape, sz)
 
-            # Which pixels can be assessed.
-            for j in range(count):
-                f = marks[j]
-                least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
-                most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
-                wanted = assess[j] != 0
-                lit, seen = cos_i[j] > ZERO, cos_r[j] > ZERO
-                steep = (least >= cos_min[j]) & (most <= cos_max[j])
-                free = lit & seen & steep & ((f & HIDDEN) == 0)
-                assess[j] = np.int32(wanted & free)
-                f |= NO_FLAG if free else NOT_ASSESSED
-                f |= NO_FLAG if lit else SELF_SHADOW
-                f |= NO_FLAG if seen else NOT_VIEWED
-                f |= GRAZING if lit & seen & (not steep) else NO_FLAG
-                marks[j] = f if wanted else marks[j]
-            total_assessed = 0
-            for j in range(count):
-                total_assessed += assess[j]
-            if total_assessed == 0:
-                _count_states(tally, table, present, kind, missing, assess, state, count)
-                continue
-
-            # G / (cos_i cos_r), on the plane that R refers to; finite at grazing angles.
-            attenuated = 0
-            for j in range(count):
-                good = assess[j] != 0
-                least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
-                most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
-                total = cos_i[j] + cos_r[j]
-                c2 = cos_l[j] * cos_l[j]
-                inside = least * total >= c2
-                attenuated += np.int32(good & (not inside))
-                whole = (simplified[j] != 0) | inside
-                numerator = ONE if whole else total
-                denominator = cos_i[j] * cos_r[j] if whole else most * c2
-                on_level = horizontal[j] != 0
-                numerator = numerator * (cos_i[j] if on_level else ONE)
-                denominator = denominator * (sz[j] if on_level else ONE)
-                shape[j] = (numerator if good else ZERO) / (denominator if good else ONE)
-            tally.attenuated[0] += attenuated
-
-            # The lobe of each band; bands with the same w, n, k share it.
-            may_skip, outside = skip and not exact, False
-            for q in range(1, materials):
-                may_skip &= not (present[q] and table.peak[q]) or table.one_w[q]
-            for b in range(bands):
+            # The reflectance to remove in each band; bands with the same w, n, k share the lobe. A chunk is out of
+            # the lobe if the largest pi beta t1 F times the exponential stays below the threshold everywhere.
+            may_skip = skip
+            for q in range(1, present.size):
+                may_skip &= not present[q] or one_w[q]
+            for b in range(bands if inside else 0):
                 again = b == 0
-                for q in range(1, materials):
-                    again |= present[q] and table.peak[q] and not table.shared[q, b]
+                for q in range(1, present.size):
+                    again |= present[q] and not shared_of[q, b]
                 if again and exact:
                     for j in range(count):
                         lobe[j] = ZERO
                         if assess[j] != 0:
                             q = kind[j]
                             angles = geometry((sx[j], sy[j], sz[j]), (vx[j], vy[j], vz[j]), (nx[j], ny[j], nz[j]))
-                            f = specular(angles, table.w[q, b], table.n[q, b], table.k[q, b], simplified[j] != 0)
-                            lobe[j] = f * cos_i[j] / sz[j] if horizontal[j] != 0 else f
+                            f = specular(angles, table.w[q, b], n_of[q, b], k_of[q, b], simplified[j] != 0)
+                            lobe[j] = f * angles[0] / sz[j] if horizontal[j] != 0 else f
                 elif again:
-                    for q in range(1, materials):
-                        if present[q] and table.peak[q]:
-                            part, q32 = table.w2[q, b], np.int32(q)
-                            for j in range(count):
-                                w2[j] = part if kind[j] == q32 else w2[j]
-                    for j in range(count):
-                        x = w2[j] * alpha2[j] * MINUS_LOG2_E
-                        x = x if x > LOWEST_EXPONENT else LOWEST_EXPONENT
-                        integer = np.int32(x - HALF)  # x <= 0: rounds to the nearest
-                        power_bits[j] = (integer + np.int32(127)) << np.int32(23)
-                        exponential[j] = x - np.float32(integer)
-                    for j in range(count):
-                        x = exponential[j]
-                        p = (((((E6 * x + E5) * x + E4) * x + E3) * x + E2) * x + E1) * x + ONE
-                        exponential[j] = p * power[j] * shape[j]
-                    if may_skip and b == 0:
-                        inside_lobe = np.int32(0)
-                        for j in range(count):
-                            inside_lobe |= np.int32(peak[j] * exponential[j] >= negligible[j] * BOUND_MARGIN)
-                        if inside_lobe == 0:
-                            outside = True
-                            break
-                    for q in range(1, materials):
-                        if not (present[q] and table.peak[q]):
-                            continue
-                        q32 = np.int32(q)
-                        if table.fresnel_exact[q, b]:
-                            for j in range(count):
-                                if kind[j] == q32:
-                                    f = fresnel(np.float64(cos_l[j]), table.n[q, b], table.k[q, b])
-                                    lobe[j] = f * exponential[j]
-                        else:
-                            scale, shift = table.fresnel_scale[q], table.fresnel_shift[q]
-                            c = table.fresnel[q, b]
-                            f0, f1, f2, f3, f4, f5, f6 = c[0], c[1], c[2], c[3], c[4], c[5], c[6]
-                            f7, f8, f9, f10, f11, f12 = c[7], c[8], c[9], c[10], c[11], c[12]
-                            for j in range(count):
-                                x = cos_l[j] * scale + shift
-                                f = (((((f12 * x + f11) * x + f10) * x + f9) * x + f8) * x + f7) * x + f6
-                                f = (((((f * x + f5) * x + f4) * x + f3) * x + f2) * x + f1) * x + f0
-                                lobe[j] = f * exponential[j] if kind[j] == q32 else lobe[j]
-                amounts = amount[b]
-                for q in range(1, materials):
-                    if present[q] and table.peak[q]:
-                        gain, q32 = table.gain[q, b], np.int32(q)
-                        for j in range(count):
-                            amounts[j] = gain * lobe[j] if kind[j] == q32 else amounts[j]
-
-            if outside:
-                for j in range(count):
-                    state[j] = 0
-                tally.out_of_lobe[0] += total_assessed
-                _count_states(tally, table, present, kind, missing, assess, state, count)
-                if (first_row + row) % stride == 0:
-                    _tally_geometry(tally, count, kind, assess, cos_i, alpha2)
-                continue
+                    for q in range(1, present.size):
+                        if present[q]:
+                            _set(w2, kind, np.int32(q), w2_of[q, b])
+                    _set_exponential(exponential, power_bits, power, w2, alpha2, shape)
+                    if may_skip and b == 0 and _is_outside(negligible, bound, exponential, count):
+                        inside = False
+                        tally.out_of_lobe[0] += assessed
+                        break
+                    for q in range(1, present.size):
+                        if present[q]:
+                            _set_lobe(
+                                lobe, kind, cos_l, exponential, np.int32(q), fresnel_of[q, b], n_of[q, b], k_of[q, b]
+                            )
+                for q in range(1, present.size):
+                    if present[q]:
+                        _set_amount(amount[b], lobe, kind, np.int32(q), gain_of[q, b])
 
             # What becomes of each pixel.
-            for j in range(count):
-                hit[j] = 0
-                over[j] = full[j]
-                share[j] = ZERO
-            for b in range(bands):
-                scale, offset = rules.scale[b], rules.offset[b]
-                values, amounts = image[b, row, start:stop], amount[b]
-                for j in range(count):
-                    a = amounts[j]
-                    above = (assess[j] != 0) & (a >= negligible[j])
-                    r = real.type(values[j]) * scale + offset
-                    bright = r > ZERO
-                    part = (a if bright else TWO) / (r if bright else ONE)
-                    part = part if above else ZERO
-                    share[j] = part if part > share[j] else share[j]
-                    amounts[j] = a if above else ZERO
-                    hit[j] |= np.int32(above)
-                    over[j] |= np.int32(above & (part > limit[j]))
-            hits, blanks = 0, 0
-            for j in range(count):
-                over[j] &= hit[j]
-                state[j] = hit[j] + over[j]
-                clipped[j] = 0
-                hits += hit[j]
-                blanks += np.int32((over[j] != 0) & (policy[j] == BLANK))
-            _count_states(tally, table, present, kind, missing, assess, state, count)
-
-            if hits > 0:
+            _clear(hit)
+            _clear(state)
+            share[:] = ZERO
+            if inside:
                 for b in range(bands):
-                    steps, lowest, saturation = rules.steps[b], rules.lowest[b], rules.saturation[b]
-                    values, amounts = image[b, row, start:stop], amount[b]
-                    nodata, dodges = real.type(rules.nodata[0]), rules.dodge
-                    if rules.integer:
-                        for j in range(count):
-                            exponential[j] = real.type(np.int32(amounts[j] * steps + HALF))
-                    else:
-                        for j in range(count):
-                            exponential[j] = amounts[j] * steps
-                    for j in range(count):
-                        value = real.type(values[j])
-                        new = value - exponential[j]
-                        low = new < lowest
-                        floor = lowest if lowest < value else value
-                        new = floor if low else new
-                        dodge = dodges & (new == nodata)
-                        new = new + ONE if dodge else new
-                        take = (amounts[j] > ZERO) & (value < saturation)
-                        take = take & ((state[j] == 1) | (policy[j] == BEST))
-                        clipped[j] |= np.int32(take & (low | dodge))
-                        new = new if take else value
-                        exponential[j] = new
-                        amounts[j] = value - new
-                    if rules.integer:
-                        for j in range(count):
-                            values[j] = np.int32(exponential[j])
-                    else:
-                        for j in range(count):
-                            values[j] = exponential[j]
+                    line = image[b, row, start:stop]
+                    _weigh(amount[b], line, scale[b], offset[b], assess, negligible, limit, hit, state, share)
+            hits = _settle(hit, state, saturated, count)
+            for q in range(1, present.size):
+                if present[q]:
+                    _count_states(kind, missing, assess, state, np.int32(q), count, states)
+            if hits > 0:
+                _clear(clipped)
+                for b in range(bands):
+                    line = image[b, row, start:stop]
+                    _subtract(
+                        amount[b],
+                        line,
+                        new_values,
+                        state,
+                        policy,
+                        clipped,
+                        steps[b],
+                        lowest[b],
+                        saturation[b],
+                        nodata[0],
+                        dodges,
+                        integer,
+                    )
                     if want_removed:
-                        taken = removed[b, row, start:stop]
-                        for j in range(count):
-                            taken[j] = amounts[j] if hit[j] != 0 else taken[j]
-                for j in range(count):
-                    f = marks[j] | (CLIPPED if clipped[j] != 0 else NO_FLAG)
-                    f |= CORRECTED if state[j] == 1 else NO_FLAG
-                    marks[j] = f | (UNCORRECTABLE if state[j] == 2 else NO_FLAG)
+                        _keep(amount[b], removed[b, row, start:stop], hit)
+                blanks = _mark_states(marks, state, clipped, policy)
                 if blanks > 0:
                     for b in range(bands):
-                        for j in range(count):
-                            if state[j] == 2 and policy[j] == BLANK:
-                                image[b, row, start + j] = rules.nodata[0]
-
-            if (first_row + row) % stride == 0:
-                _tally_geometry(tally, count, kind, assess, cos_i, alpha2)
+                        _blank(image[b, row, start:stop], state, policy, nodata[0])
+            if tallied and assessed > 0:
+                _tally_geometry(kind, assess, cos_i, alpha2, count, tally)
                 if hits > 0:
-                    _tally_removed(tally, rules, count, kind, hit, share, amount, cos_i, cos_r, cos_l, simplified)
+                    _tally_removed(kind, hit, simplified, cos_i, cos_r, cos_l, share, amount, count, rules, tally)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count_states(tally, table, present, kind, missing, assess, state, count):
-    """Pixels of a chunk by material and state, for the materials with a peak."""
-    for q in range(1, present.size):
-        if present[q] and table.peak[q]:
-            q32 = np.int32(q)
-            negligible, corrected, uncorrectable, refused = 0, 0, 0, 0
-            for j in range(count):
-                mine = (kind[j] == q32) & (missing[j] == 0)
-                done = mine & (assess[j] != 0)
-                refused += np.int32(mine & (assess[j] == 0))
-                negligible += np.int32(done & (state[j] == 0))
-                corrected += np.int32(done & (state[j] == 1))
-                uncorrectable += np.int32(done & (state[j] == 2))
-            tally.states[q, 0] += negligible
-            tally.states[q, 1] += corrected
-            tally.states[q, 2] += uncorrectable
-            tally.states[q, 3] += refused
+def _clear(values):
+    """Zeros."""
+    for j in range(CHUNK):
+        values[j] = 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tally_geometry(tally, count, kind, assess, cos_i, alpha2):
+def _set_constants(fixed, sun, view, normal):
+    """The first vector of each field along whole lines: what `_line` gives for a field of one pixel."""
+    for c in range(3):
+        fixed[c, :], fixed[c + 3, :], fixed[c + 6, :] = sun[c, 0, 0], view[c, 0, 0], normal[c, 0, 0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _line(field, fixed, place, row, start, stop):
+    """A piece of a row of one component of a vector field, constant where the field is one pixel."""
+    return fixed[place, : stop - start] if field.shape[1] == 1 else field[place % 3, row, start:stop]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _look(missing, saturated, line, saturation, has_nodata, nodata):
+    """Which pixels have no data in a band, and which are saturated in it."""
+    for j in range(line.size):
+        value = np.float32(line[j])
+        missing[j] |= np.int32(value - value != ZERO)
+        saturated[j] |= np.int32(value >= saturation)
+    if has_nodata:
+        for j in range(line.size):
+            missing[j] |= np.int32(line[j] == nodata)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _list(kind, present, line):
+    """The material of each pixel, as wide as the other arrays, and which materials there are."""
+    present[:] = False
+    for j in range(line.size):
+        present[line[j]] = True
+    for j in range(line.size):
+        kind[j] = line[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mark(marks, kind, missing, saturated, q32, peak, states):
+    """The flags of one material's pixels that need no geometry; counts those that are done with."""
+    known = ON_ENTRY if peak else QUALITY
+    none = NO_MATERIAL | NOT_ASSESSED if q32 == 0 else NO_FLAG
+    pixels, gaps = 0, 0
+    for j in range(marks.size):
+        mine, gap = kind[j] == q32, missing[j] != 0
+        f = (marks[j] & known) | none | (SATURATED if saturated[j] != 0 else NO_FLAG)
+        f = (marks[j] & QUALITY) | NODATA | NOT_ASSESSED if gap else f
+        marks[j] = f if mine else marks[j]
+        pixels += np.int32(mine)
+        gaps += np.int32(mine & gap)
+    states[q32, 3] += pixels if q32 == 0 else gaps
+    if not peak and q32 > 0:
+        states[q32, 0] += pixels - gaps
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cosines(cos_i, cos_r, cos_l, alpha2, sx, sy, sz, vx, vy, vz, nx, ny, nz):
+    """Directions to angles about the facet; alpha^2 by a polynomial in |n - h|^2 / 2 = 1 - cos alpha."""
+    for j in range(sx.size):
+        hx, hy, hz = sx[j] + vx[j], sy[j] + vy[j], sz[j] + vz[j]
+        length = math.sqrt(hx * hx + hy * hy + hz * hz)
+        inverse = ONE / length
+        dx, dy, dz = nx[j] - hx * inverse, ny[j] - hy * inverse, nz[j] - hz * inverse
+        u = (dx * dx + dy * dy + dz * dz) * HALF
+        high = (((A8 * u + A7) * u + A6) * u + A5) * u + A4
+        alpha2[j] = ((((high * u + A3) * u + A2) * u + A1) * u + A0) * u
+        cos_i[j] = nx[j] * sx[j] + ny[j] * sy[j] + nz[j] * sz[j]
+        cos_r[j] = nx[j] * vx[j] + ny[j] * vy[j] + nz[j] * vz[j]
+        cos_l[j] = length * HALF
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _set(values, kind, q32, value):
+    """Set the value of the pixels of one material."""
+    for j in range(CHUNK):
+        values[j] = value if kind[j] == q32 else values[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _want(assess, kind, missing, q32, count):
+    """The pixels of one material are to be assessed where there is data."""
+    for j in range(count):
+        assess[j] |= np.int32((kind[j] == q32) & (missing[j] == 0))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _assess(assess, cos_min, cos_max, cos_i, cos_r, marks):
+    """Leave out pixels that are not lit, not seen, too steep or hidden, and flag why; the number that is left."""
+    for j in range(marks.size):
+        f = marks[j]
+        least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
+        most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
+        wanted = assess[j] != 0
+        lit, seen = cos_i[j] > ZERO, cos_r[j] > ZERO
+        steep = (least >= cos_min[j]) & (most <= cos_max[j])
+        free = lit & seen & steep & ((f & HIDDEN) == 0)
+        assess[j] = np.int32(wanted & free)
+        f |= NO_FLAG if free else NOT_ASSESSED
+        f |= NO_FLAG if lit else SELF_SHADOW
+        f |= NO_FLAG if seen else NOT_VIEWED
+        f |= GRAZING if lit & seen & (not steep) else NO_FLAG
+        marks[j] = f if wanted else marks[j]
+    total = 0
+    for j in range(marks.size):
+        total += assess[j]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _set_shape(assess, simplified, horizontal, cos_i, cos_r, cos_l, shape, sz):
+    """G / (cos_i cos_r), on the plane that R refers to; finite at grazing angles. The number of pixels with G < 1."""
+    attenuated = 0
+    for j in range(sz.size):
+        good = assess[j] != 0
+        least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
+        most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
+        total = cos_i[j] + cos_r[j]
+        c2 = cos_l[j] * cos_l[j]
+        inside = least * total >= c2
+        attenuated += np.int32(good & (not inside))
+        whole = (simplified[j] != 0) | inside
+        numerator = ONE if whole else total
+        denominator = cos_i[j] * cos_r[j] if whole else most * c2
+        level = horizontal[j] != 0
+        numerator = numerator * (cos_i[j] if level else ONE)
+        denominator = denominator * (sz[j] if level else ONE)
+        shape[j] = (numerator if good else ZERO) / (denominator if good else ONE)
+    return attenuated
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _set_amount(amounts, lobe, kind, q32, gain):
+    """Amount of the pixels of one material in one band."""
+    for j in range(CHUNK):
+        amounts[j] = gain * lobe[j] if kind[j] == q32 else amounts[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _set_exponential(exponential, power_bits, power, w2, alpha2, shape):
+    """exp(-w^2 alpha^2) times the shape: 2^x from the whole part of x as bits and a polynomial of the rest.
+
+    power : the memory of `power_bits`, read as float32.
+    """
+    for j in range(CHUNK):
+        x = w2[j] * alpha2[j] * MINUS_LOG2_E
+        x = x if x > LOWEST_EXPONENT else LOWEST_EXPONENT
+        whole = np.int32(x - HALF)  # x <= 0: rounds to the nearest
+        power_bits[j] = (whole + np.int32(127)) << np.int32(23)
+        exponential[j] = x - np.float32(whole)
+    for j in range(CHUNK):
+        x = exponential[j]
+        p = (((((E6 * x + E5) * x + E4) * x + E3) * x + E2) * x + E1) * x + ONE
+        exponential[j] = p * power[j] * shape[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_outside(negligible, bound, exponential, count):
+    """Whether no pixel of the chunk can have as much as its threshold to remove."""
+    inside = np.int32(0)
+    for j in range(count):
+        inside |= np.int32(bound[j] * exponential[j] >= negligible[j] * BOUND_MARGIN)
+    return inside == 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _set_lobe(lobe, kind, cos_l, exponential, q32, c, n, k):
+    """f_spec of the pixels of one material: F times the exponential; F by polynomial or, where scale is 0, exact."""
+    scale, shift = c[FRESNEL_DEGREE + 1], c[FRESNEL_DEGREE + 2]
+    if scale == 0:
+        for j in range(CHUNK):
+            if kind[j] == q32:
+                lobe[j] = fresnel(np.float64(cos_l[j]), n, k) * exponential[j]
+        return
+    f0, f1, f2, f3, f4, f5, f6 = c[0], c[1], c[2], c[3], c[4], c[5], c[6]
+    f7, f8, f9, f10, f11, f12 = c[7], c[8], c[9], c[10], c[11], c[12]
+    for j in range(CHUNK):
+        x = cos_l[j] * scale + shift
+        f = (((((f12 * x + f11) * x + f10) * x + f9) * x + f8) * x + f7) * x + f6
+        f = (((((f * x + f5) * x + f4) * x + f3) * x + f2) * x + f1) * x + f0
+        lobe[j] = f * exponential[j] if kind[j] == q32 else lobe[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(amounts, line, scale, offset, assess, negligible, limit, hit, state, share):
+    """One band's amounts against threshold and signal; amounts below the threshold become 0."""
+    for j in range(line.size):
+        a = amounts[j]
+        above = (assess[j] != 0) & (a >= negligible[j])
+        r = amounts.dtype.type(line[j]) * scale + offset
+        bright = r > ZERO
+        part = (a if bright else TWO) / (r if bright else ONE)
+        part = part if above else ZERO
+        share[j] = part if part > share[j] else share[j]
+        amounts[j] = a if above else ZERO
+        hit[j] |= np.int32(above)
+        state[j] |= np.int32(above & (part > limit[j]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _settle(hit, state, saturated, count):
+    """SPECULAR_STATE from what `_weigh` found in all bands; the number of pixels with something to remove."""
+    hits = 0
+    for j in range(count):
+        state[j] = hit[j] + ((state[j] | saturated[j]) & hit[j])
+        hits += hit[j]
+    return hits
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _subtract(amounts, line, new_values, state, policy, clipped, steps, lowest, saturation, nodata, dodges, integer):
+    """One band less its amounts, rounded to stored steps and held above 0; `amounts` become what was taken."""
+    real = amounts.dtype
+    least, blank = lowest, real.type(nodata)
+    if integer:
+        for j in range(line.size):
+            new_values[j] = real.type(np.int32(amounts[j] * steps + HALF))
+    else:
+        for j in range(line.size):
+            new_values[j] = amounts[j] * steps
+    for j in range(line.size):
+        value = real.type(line[j])
+        new = value - new_values[j]
+        low = new < least
+        floor = least if least < value else value
+        new = floor if low else new
+        dodge = dodges & (new == blank)
+        new = new + ONE if dodge else new
+        take = (amounts[j] > ZERO) & (value < saturation)
+        take = take & ((state[j] == 1) | (policy[j] == BEST))
+        clipped[j] |= np.int32(take & (low | dodge))
+        new = new if take else value
+        new_values[j] = new
+        amounts[j] = value - new
+    if integer:
+        for j in range(line.size):
+            line[j] = np.int32(new_values[j])
+    else:
+        for j in range(line.size):
+            line[j] = new_values[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mark_states(marks, state, clipped, policy):
+    """Flag what became of the pixels; the number of those to be blanked."""
+    blanks = 0
+    for j in range(marks.size):
+        f = marks[j] | (CLIPPED if clipped[j] != 0 else NO_FLAG)
+        f |= CORRECTED if state[j] == 1 else NO_FLAG
+        marks[j] = f | (UNCORRECTABLE if state[j] == 2 else NO_FLAG)
+        blanks += np.int32((state[j] == 2) & (policy[j] == BLANK))
+    return blanks
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blank(line, state, policy, nodata):
+    """Nodata where a pixel is uncorrectable and its material wants it so."""
+    for j in range(line.size):
+        if state[j] == 2 and policy[j] == BLANK:
+            line[j] = nodata
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _keep(amounts, taken, hit):
+    """Write down what was taken from one band."""
+    for j in range(taken.size):
+        taken[j] = amounts[j] if hit[j] != 0 else taken[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_states(kind, missing, assess, state, q32, count, states):
+    """Pixels of one material by state, of those with data."""
+    negligible, corrected, uncorrectable, refused = 0, 0, 0, 0
+    for j in range(count):
+        mine = (kind[j] == q32) & (missing[j] == 0)
+        done = mine & (assess[j] != 0)
+        refused += np.int32(mine & (assess[j] == 0))
+        negligible += np.int32(done & (state[j] == 0))
+        corrected += np.int32(done & (state[j] == 1))
+        uncorrectable += np.int32(done & (state[j] == 2))
+    states[q32, 0] += negligible
+    states[q32, 1] += corrected
+    states[q32, 2] += uncorrectable
+    states[q32, 3] += refused
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tally_geometry(kind, assess, cos_i, alpha2, count, tally):
     """Histograms of the angle of incidence and of the facet tilt over the assessed pixels of a chunk."""
     for j in range(count):
         if assess[j] != 0:
@@ -559,7 +671,7 @@ def _tally_geometry(tally, count, kind, assess, cos_i, alpha2):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tally_removed(tally, rules, count, kind, hit, share, amount, cos_i, cos_r, cos_l, simplified):
+def _tally_removed(kind, hit, simplified, cos_i, cos_r, cos_l, share, amount, count, rules, tally):
     """Share, removed reflectance and the difference that G makes, over the pixels inside the lobe."""
     for j in range(count):
         if hit[j] != 0:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tscorr import kernels, reference
 from tscorr.correction.rules import Rules, Stored
+from tscorr.errors import InputError
 from tscorr.materials import BandParameters, Material, material
 
 Array = NDArray[Any]
@@ -31,7 +32,8 @@ def pixel_rules(stored: Stored) -> dict[np.dtype[Any], kernels.PixelRules]:
     if not integer and stored.nodata == 0:
         lowest = np.where(lowest == 0, np.finfo(np.float32).tiny, lowest)
     saturation = np.full(bands, np.inf) if stored.saturation is None else np.array(stored.saturation)
-    has_nodata = stored.nodata is not None and not np.isnan(stored.nodata)
+    nodata = stored.nodata if stored.nodata is not None and stored.has_nodata else 0
+    has_nodata = stored.has_nodata and not np.isnan(nodata)
     return {
         np.dtype(real): kernels.PixelRules(
             scale=scale.astype(real),
@@ -39,7 +41,7 @@ def pixel_rules(stored: Stored) -> dict[np.dtype[Any], kernels.PixelRules]:
             steps=(1 / scale).astype(real),
             saturation=saturation.astype(real),
             lowest=lowest.astype(real),
-            nodata=np.array([0 if stored.nodata is None else stored.nodata]).astype(dtype),
+            nodata=np.array([nodata]).astype(dtype),
             has_nodata=has_nodata,
             dodge=has_nodata and integer,
             integer=integer,
@@ -58,7 +60,8 @@ def computed_precision(surface: Material, parameters: BandParameters, rules: Rul
     """
     if rules.precision != "fast":
         return rules.precision
-    narrow = parameters.w * (2 + 1 / _cosine(_steepest(surface, rules))) > 1
+    cos_least = _cosine(_steepest(surface, rules))
+    narrow = parameters.w * (2 * cos_least + 1) > cos_least
     kinked = (parameters.n < 1) & (parameters.k < 0.05)
     return "exact" if np.any((parameters.t1 > 0) & (narrow | kinked)) else "fast"
 
@@ -76,6 +79,11 @@ def material_table(materials: Sequence[Entry], bands: int, real: type[np.floatin
 
 
 def _material_row(surface: Material, parameters: BandParameters, rules: Rules, bands: int) -> dict[str, Any]:
+    if len(parameters.t0) != bands or len(rules.direct_fraction) not in {1, bands}:
+        raise InputError(
+            f"material '{surface.name}' has parameters for {len(parameters.t0)} bands and "
+            f"{len(rules.direct_fraction)} direct fractions; the image has {bands} bands"
+        )
     beta = np.broadcast_to(np.array(rules.direct_fraction, dtype=float), bands)
     gain = np.pi * beta * parameters.t1
     low, steepest = surface.zenith_range_deg[0], _steepest(surface, rules)
@@ -93,10 +101,7 @@ def _material_row(surface: Material, parameters: BandParameters, rules: Rules, b
         "w2": np.rad2deg(parameters.w) ** 2,
         "n": parameters.n,
         "k": parameters.k,
-        "fresnel": [fit for fit, _ in fits],
-        "fresnel_scale": 2 / (1 - cos_steepest),
-        "fresnel_shift": -(1 + cos_steepest) / (1 - cos_steepest),
-        "fresnel_exact": [error > FRESNEL_ERROR for _, error in fits],
+        "fresnel": fits,
         "shared": shared,
         "bound": float(np.max(gain * _fresnel_bound(parameters.n, parameters.k, cos_steepest))),
         "one_w": bool(np.all(parameters.w == parameters.w[0])),
@@ -131,29 +136,33 @@ def _fresnel_bound(n: Array, k: Array, cos_min: float) -> Array:
 
 
 @cache
-def fresnel_polynomial(n: float, k: float, max_zenith_deg: float) -> tuple[tuple[float, ...], float]:
-    """Coefficients of F over local angles from 0 to `max_zenith_deg`, and their largest relative error.
+def fresnel_polynomial(n: float, k: float, max_zenith_deg: float) -> tuple[float, ...]:
+    """F over local angles from 0 to `max_zenith_deg` as a row of MaterialTable.fresnel.
 
     The polynomial is in x = cos_l mapped to [-1, 1], lowest power first, fitted with weights 1/F and checked
     as the kernel evaluates it, in float32. The local angle never exceeds the larger of incidence and exitance,
-    so the range holds for every pixel that is assessed, however the scene is cut into blocks.
+    so the range holds for every pixel that is assessed, however the scene is cut into blocks. Where the relative
+    error exceeds FRESNEL_ERROR all is 0, which asks for the equations themselves.
     """
+    degree = kernels.FRESNEL_DEGREE
     cos_min = _cosine(max_zenith_deg)
     nodes = np.cos(np.pi * (np.arange(400) + 0.5) / 400)
     values = reference.fresnel((1 - cos_min) / 2 * nodes + (1 + cos_min) / 2, n, k)  # type: ignore[arg-type]
     if not np.all(values > 0):
-        return (0.0,) * (kernels.FRESNEL_DEGREE + 1), float("inf")
-    series = chebyshev.chebfit(nodes, values, kernels.FRESNEL_DEGREE, w=1 / values)
-    powers = chebyshev.cheb2poly(series)
-    powers = np.pad(powers, (0, kernels.FRESNEL_DEGREE + 1 - len(powers)))
-    cosines = np.linspace(cos_min, 1, 5001)
-    scale, shift = np.float32(2 / (1 - cos_min)), np.float32(-(1 + cos_min) / (1 - cos_min))
-    x = cosines.astype(np.float32) * scale + shift
+        return (0.0,) * (degree + 3)
+    series = chebyshev.chebfit(nodes, values, degree, w=1 / values)
+    powers = np.zeros(degree + 1)
+    powers[: len(series)] = chebyshev.cheb2poly(series)
+    cosines = np.linspace(cos_min, 1, 5001).astype(np.float32)
+    scale, shift = 2 / (1 - cos_min), -(1 + cos_min) / (1 - cos_min)
+    x = cosines * np.float32(scale) + np.float32(shift)
     result = np.zeros_like(x)
     for coefficient in powers[::-1].astype(np.float32):
         result = result * x + coefficient
-    exact = reference.fresnel(cosines.astype(np.float32).astype(float), n, k)  # type: ignore[arg-type]
-    return tuple(map(float, powers)), float(np.max(np.abs(result / exact - 1)))
+    exact = reference.fresnel(cosines.astype(float), n, k)  # type: ignore[arg-type]
+    if np.max(np.abs(result / exact - 1)) > FRESNEL_ERROR:
+        return (0.0,) * (degree + 3)
+    return (*map(float, powers), scale, shift)
 
 
 def new_tally(materials: int, bands: int) -> kernels.Tally:
