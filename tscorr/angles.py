@@ -72,8 +72,9 @@ def facet_angles(sun: Array, view: Array, normal: Array) -> dict[str, Array]:
     sun, view, normal = np.broadcast_arrays(sun, view, normal)
     half = sun + view
     half = half / np.sqrt((half**2).sum(axis=0))
-    along = (sun * view).sum(axis=0) - (sun * normal).sum(axis=0) * (view * normal).sum(axis=0)
-    across = (normal * np.cross(sun, view, axis=0)).sum(axis=0)
+    beside_sun, beside_view = np.cross(normal, sun, axis=0), np.cross(normal, view, axis=0)
+    along = (beside_sun * beside_view).sum(axis=0)
+    across = (normal * np.cross(beside_sun, beside_view, axis=0)).sum(axis=0)
     return {
         "incidence": angle_between(sun, normal),
         "exitance": angle_between(view, normal),

@@ -31,7 +31,7 @@ def brdf(
     wavelength_um : needed where the material has several wavelengths.
 
     >>> float(round(brdf("roof_tile", 50, 50, 180)[()], 6))
-    0.075590
+    0.075591
     """
     known = material(surface) if isinstance(surface, str) else surface
     parameters = known.at(None if wavelength_um is None else [wavelength_um])
@@ -89,7 +89,8 @@ def correct(
         if image.dtype.kind != "f":
             raise InputError(f"an image of {image.dtype}; allowed are uint8, int16, uint16 and floating point")
         image = image.astype(np.float32)
-    cube = np.array(image[None] if image.ndim == 2 else image, order="C")
+    native = image.dtype.newbyteorder("=")
+    cube = np.array(image[None] if image.ndim == 2 else image, dtype=native, order="C")
     class_map = np.asarray(classes)
     if cube.ndim != 3 or class_map.shape != cube.shape[1:]:
         raise InputError(f"an image of shape {image.shape} and classes of shape {class_map.shape} do not fit")

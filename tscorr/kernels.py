@@ -47,6 +47,8 @@ E1, E2, E3 = np.float32(0.6931472), np.float32(0.24022646), np.float32(0.0555032
 E4, E5, E6 = np.float32(0.00961852), np.float32(0.001339986), np.float32(0.00015337576)
 MINUS_LOG2_E = np.float32(-1.4426950408889634)
 TWO_TO_32 = 4294967296.0
+MOST_STEPS = np.float32(2**30)
+"""more stored steps than any image has, and fewer than overflow an int32"""
 BOUND_MARGIN = np.float32(0.999)
 """a chunk is skipped where its bound is below this part of the threshold: room for rounding"""
 LOWEST_EXPONENT = np.float32(-126)  # of a normal float32; below, exp is 0
@@ -384,7 +386,7 @@ def _set_constants(fixed, sun, view, normal):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _line(field, fixed, place, row, start, stop):
     """A piece of a row of one component of a vector field, constant where the field is one pixel."""
-    return fixed[place, : stop - start] if field.shape[1] == 1 else field[place % 3, row, start:stop]
+    return fixed[place, : stop - start] if field[0].size == 1 else field[place % 3, row, start:stop]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -432,7 +434,7 @@ def _cosines(cos_i, cos_r, cos_l, alpha2, sx, sy, sz, vx, vy, vz, nx, ny, nz):
     """Directions to angles about the facet; alpha^2 by a polynomial in |n - h|^2 / 2 = 1 - cos alpha."""
     for j in range(sx.size):
         hx, hy, hz = sx[j] + vx[j], sy[j] + vy[j], sz[j] + vz[j]
-        length = math.sqrt(hx * hx + hy * hy + hz * hz)
+        length = cos_l.dtype.type(math.sqrt(hx * hx + hy * hy + hz * hz))
         inverse = ONE / length
         dx, dy, dz = nx[j] - hx * inverse, ny[j] - hy * inverse, nz[j] - hz * inverse
         u = (dx * dx + dy * dy + dz * dz) * HALF
@@ -587,10 +589,11 @@ def _subtract(amounts, line, new_values, state, policy, clipped, steps, lowest, 
     least, blank = lowest, real.type(nodata)
     if integer:
         for j in range(line.size):
-            new_values[j] = real.type(np.int32(amounts[j] * steps + HALF))
+            step = amounts[j] * steps + HALF
+            new_values[j] = real.type(np.int32(step if step < MOST_STEPS else MOST_STEPS))
     else:
         for j in range(line.size):
-            new_values[j] = amounts[j] * steps
+            new_values[j] = np.float32(amounts[j] * steps)  # so that input - removed is exact in the file
     for j in range(line.size):
         value = real.type(line[j])
         new = value - new_values[j]

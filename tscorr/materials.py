@@ -1,7 +1,7 @@
 """Materials: Torrance-Sparrow parameters with their source and errors, and the library of the paper."""
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import resources
@@ -160,6 +160,9 @@ def _material(name: str, table: Any, file: str) -> Material:
     if missing:
         raise MaterialError(f"{where} lacks {', '.join(missing)}")
     values: dict[str, Any] = dict(table)
+    for key, (is_right, allowed) in TYPES.items():
+        if key in values and not is_right(values[key]):
+            raise MaterialError(f"{where} {key} = {values[key]!r}; allowed is {allowed}")
     for key in (*PARAMETERS, "wavelength_um"):
         if key in values:
             values[key] = _numbers(values[key], f"{where} {key}")
@@ -172,9 +175,31 @@ def _material(name: str, table: Any, file: str) -> Material:
 def _numbers(value: Any, where: str) -> tuple[float, ...]:
     """A number or a list of numbers as a tuple."""
     items = value if isinstance(value, list) else [value]
-    if not items or any(isinstance(item, bool) or not isinstance(item, int | float) for item in items):
+    if not items or not all(map(_is_number, items)):
         raise MaterialError(f"{where} = {value!r}; allowed is a number or a list of numbers")
     return tuple(float(item) for item in items)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_is_number, value))
+
+
+def _is_square(value: Any) -> bool:
+    return isinstance(value, list) and all(_is_list(row) and len(row) == len(value) for row in value)
+
+
+TYPES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "source": (lambda value: isinstance(value, str), "a text"),
+    "chi2_dof": (_is_number, "a number"),
+    "zenith_range_deg": (_is_list, "[low, high]"),
+    "sigma": (lambda value: isinstance(value, dict) and _is_list(list(value.values())), "a table of numbers"),
+    "covariance": (_is_square, "4 x 4 numbers in the order t0, t1, w, n"),
+}
+"""what a material file may hold besides numbers and lists of them"""
 
 
 def _frozen(value: Any) -> Any:

@@ -69,8 +69,8 @@ def geometry(sun: Array, view: Array, normal: Array) -> Geometry:
     Goes through the paper's angles; its digits are those of the vectors.
     """
     theta_i, theta_r = _angle_between(sun, normal), _angle_between(view, normal)
-    across = _dot(normal, _cross(sun, view))
-    along = _dot(sun, view) - _dot(sun, normal) * _dot(view, normal)
+    beside_sun, beside_view = _cross(normal, sun), _cross(normal, view)
+    across, along = _dot(normal, _cross(beside_sun, beside_view)), _dot(beside_sun, beside_view)
     phi = np.rad2deg(np.abs(np.arctan2(across, along)))
     return geometry_from_angles(np.rad2deg(theta_i), np.rad2deg(theta_r), phi)
 
@@ -283,7 +283,7 @@ def _share(amount: Array, reflectance: Array) -> Array:
 def _subtract(values: Array, amount: Array, rules: Any) -> tuple[Array, Array]:
     """Stored values less the amount, rounded to stored steps and held above 0; and where they were held."""
     steps = amount * rules.steps[:, None]
-    new = values - (np.floor(steps + 0.5) if rules.integer else steps)
+    new = values - (np.floor(steps + 0.5) if rules.integer else steps.astype(np.float32))
     lowest = rules.lowest[:, None]
     low = new < lowest
     new = np.where(low, np.minimum(values, lowest), new)

@@ -12,14 +12,16 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
 
 from tscorr.correction import PixelFlag, SpecularState
 from tscorr.grid import Grid, longitude_latitude
-from tscorr.rasters import RasterInfo
+
+if TYPE_CHECKING:
+    from tscorr.rasters import RasterInfo
 
 Json = dict[str, Any]
 Bands = tuple[tuple[str, ...], tuple[float, ...] | None, tuple[float, ...] | None]
@@ -74,7 +76,7 @@ def item(
     name: str,
     grid: Grid,
     datetime: dt.datetime | None,
-    files: Mapping[str, RasterInfo],
+    files: Mapping[str, "RasterInfo"],
     inputs: Sequence[Path],
     solar_zenith_deg: float,
     solar_azimuth_deg: float,
@@ -90,7 +92,7 @@ def item(
     datetime  : when the image was taken; where None, its TIFF tag or the time of its last change serves.
     files     : rasters written, by product, in the item's folder.
     inputs    : every file read, the image first.
-    view_*    : median over the scene, of surface -> sensor from the vertical and true north; nan if unknown.
+    view_*    : for the whole scene, of surface -> sensor from the vertical and true north; nan if unknown.
     report    : content of report.json.
     quicklook : whether quicklook.png was drawn.
 
@@ -147,7 +149,7 @@ def collection(*, title: str, items: Sequence[Mapping[str, Any]]) -> Json:
     }
 
 
-def _time(time: dt.datetime | None, files: Mapping[str, RasterInfo], image: Path) -> tuple[str, str]:
+def _time(time: dt.datetime | None, files: Mapping[str, "RasterInfo"], image: Path) -> tuple[str, str]:
     """Time of an image as STAC writes it, and where it is from; products have the tags of the image."""
     source = "time given for the sun"
     tag = next((info.tags[TIFF_TIME] for info in files.values() if TIFF_TIME in info.tags), None)
@@ -211,7 +213,7 @@ def _asset(file: str, media: str, title: str, roles: str) -> Json:
     return {"href": f"./{quote(file)}", "type": media, "title": title, "roles": roles.split()}
 
 
-def _raster(key: str, info: RasterInfo, bands: Bands, report: Mapping[str, Any]) -> Json:
+def _raster(key: str, info: "RasterInfo", bands: Bands, report: Mapping[str, Any]) -> Json:
     """The asset of a raster: names in the bands of the core, numbers in those of the extensions."""
     nodata = "nan" if info.nodata is not None and math.isnan(info.nodata) else info.nodata
     unit = "degree" if key in {"azimuthal_width", "angles"} else None

@@ -39,7 +39,7 @@ def albedo(
     incidence_deg : from the surface normal, 0 to below 90; nan beyond. By reciprocity also the reflectance,
                     towards that exitance, of light that comes evenly from the whole sky.
     Raises ConfigError for the simplified form, whose lobe grows like 1 / cos theta at grazing angles:
-    three of the five surfaces of the paper would reflect more light than they receive.
+    at 89 degrees four of the five surfaces of the paper would reflect more light than they receive.
 
     >>> float(round(albedo("roof_tile", 50)[()], 4))
     0.1223

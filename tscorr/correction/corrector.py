@@ -86,6 +86,8 @@ class Corrector:
     ) -> None:
         if len(materials) > 254:
             raise InputError(f"a scene has {len(materials)} materials; allowed are 254")
+        if not stored.has_nodata and any(rules.uncorrectable == "nodata" for *_, rules in materials):
+            raise InputError(f"uncorrectable = 'nodata', but the image of {stored.dtype} has no nodata value")
         self.names = tuple(entry[0].name for entry in materials)
         self.stored = stored
         self.skip = skip
@@ -150,7 +152,7 @@ class Corrector:
             inputs.image,
             removed,
             flags,
-            inputs.material,
+            np.ascontiguousarray(inputs.material),
             np.ascontiguousarray(inputs.sun, real),
             np.ascontiguousarray(inputs.view, real),
             np.ascontiguousarray(inputs.normal, real),

@@ -38,3 +38,13 @@ class Stored:
     def step(self) -> float | None:
         """The finest step of reflectance that can be stored, or None for floating point."""
         return min(map(abs, self.scale)) if self.dtype.kind in "iu" else None
+
+    @property
+    def has_nodata(self) -> bool:
+        """Whether a nodata value is given that the type can hold: -1 of an unsigned type stands nowhere."""
+        if self.nodata is None:
+            return False
+        if self.dtype.kind == "f":
+            return not np.isfinite(self.nodata) or abs(self.nodata) <= float(np.finfo(self.dtype).max)
+        limits = np.iinfo(self.dtype)
+        return float(self.nodata).is_integer() and limits.min <= self.nodata <= limits.max
