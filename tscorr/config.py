@@ -12,6 +12,8 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
     field_validator,
     model_validator,
 )
@@ -19,7 +21,17 @@ from pydantic import (
 from tscorr.errors import ConfigError, nearest
 
 Product = Literal["corrected", "flags", "removed", "azimuthal_width", "angles"]
-PerBand = float | list[float]
+
+
+def _numbers(value: Any, numbers: ValidatorFunctionWrapHandler) -> Any:
+    """One message instead of one for each half of the union."""
+    try:
+        return numbers(value)
+    except ValidationError:
+        raise ValueError("allowed is a number, or a list of numbers, one a band") from None
+
+
+PerBand = Annotated[float | list[float], WrapValidator(_numbers)]
 
 
 class Section(BaseModel):
@@ -141,12 +153,56 @@ class LineViewSettings(Section):
     """`view` of kind line."""
 
     kind: Literal["line"]
-    trajectory: str
+    trajectory: str = Field(description="CSV: utc,x,y,z[,roll_deg,pitch_deg,heading_deg]")
+    start: AwareDatetime | None = Field(None, description="first time of the line, where the file holds more")
+    end: AwareDatetime | None = None
+    crs: str | None = None
+    height_offset_m: float = 0.0
+
+    @model_validator(mode="after")
+    def _start_before_end(self) -> "LineViewSettings":
+        if self.start is not None and self.end is not None and not self.start < self.end:
+            raise ValueError("allowed is an end after the start")
+        return self
+
+
+class AnglesViewSettings(Section):
+    """`view` of kind angles."""
+
+    kind: Literal["angles"]
+    zenith: str = Field(description="raster of the view zenith angle [degrees]")
+    azimuth: str = Field(description="raster of the azimuth from true north, surface to sensor [degrees]")
+    scale: Annotated[float, Field(gt=0)] | None = Field(
+        None, description="stored value times this is degrees; default: the scale and offset of the file"
+    )
+
+
+class ObsViewSettings(Section):
+    """`view` of kind obs: an observation geometry file of JPL, EMIT or NEON; with no `sun`, the sun is its own."""
+
+    kind: Literal["obs"]
+    path: str
+
+
+class MosaicViewSettings(Section):
+    """`view` of kind mosaic."""
+
+    kind: Literal["mosaic"]
+    index: str = Field(description="raster of the number of the camera that each pixel came from")
+    cameras: str = Field(description="CSV: id,x,y,z")
     crs: str | None = None
     height_offset_m: float = 0.0
 
 
-ViewSettings = Annotated[ConstantViewSettings | FrameViewSettings | LineViewSettings, Field(discriminator="kind")]
+ViewSettings = Annotated[
+    ConstantViewSettings
+    | FrameViewSettings
+    | LineViewSettings
+    | AnglesViewSettings
+    | ObsViewSettings
+    | MosaicViewSettings,
+    Field(discriminator="kind"),
+]
 
 
 class FlatSettings(Section):
@@ -171,7 +227,17 @@ class NormalsSettings(Section):
     heights: str | None = None
 
 
-SurfaceSettings = Annotated[FlatSettings | DsmSettings | NormalsSettings, Field(discriminator="kind")]
+class ObsSurfaceSettings(Section):
+    """`surface` of kind obs: slope and aspect of an observation geometry file."""
+
+    kind: Literal["obs"]
+    path: str
+    heights: str | None = None
+
+
+SurfaceSettings = Annotated[
+    FlatSettings | DsmSettings | NormalsSettings | ObsSurfaceSettings, Field(discriminator="kind")
+]
 
 
 class Truth(Section):
@@ -276,7 +342,10 @@ def _expanded(scene: Scene, folder: Path, config: Path) -> Iterator[Scene]:
     for image in images:
         words = {"stem": image.stem, "parent": str(image.parent)}
         filled = _with_paths(scene.model_dump(), folder, words)
-        yield Scene.model_validate({**filled, "image": str(image), "name": scene.name or image.stem})
+        try:
+            yield Scene.model_validate({**filled, "image": str(image), "name": scene.name or image.stem})
+        except ValidationError as error:
+            raise ConfigError("\n".join(_problem(config, item) for item in error.errors())) from None
 
 
 def absolute(folder: Path, path: str) -> Path:
@@ -291,6 +360,7 @@ PATHS = {
     "heights",
     "trajectory",
     "zenith",
+    "azimuth",
     "index",
     "cameras",
     "diffuse",
@@ -316,7 +386,7 @@ def _require_distinct(names: list[str], config: Path) -> None:
 
 def _problem(path: Path, item: Mapping[str, Any]) -> str:
     """One line for one problem that pydantic found."""
-    location = [part for part in item["loc"] if part not in {"constant", "frame", "line", "flat", "dsm", "normals"}]
+    location = [part for i, part in enumerate(item["loc"]) if not _is_kind(item["loc"], i)]
     where = ".".join(str(part) for part in location) or "file"
     if item["type"] == "extra_forbidden":
         *place, key = location
@@ -331,6 +401,11 @@ def _problem(path: Path, item: Mapping[str, Any]) -> str:
     return f"{path}: {where} = {item['input']!r}: {message[0].lower()}{message[1:]}"
 
 
+def _is_kind(location: tuple[Any, ...], i: int) -> bool:
+    """Whether a part of a location is the kind of a view or surface, which is no key of the file."""
+    return i > 0 and location[i - 1] in {"view", "surface"} and location[i] in {**VIEWS, **SURFACES}
+
+
 def _known_keys(location: tuple[Any, ...]) -> list[str]:
     """Keys that are known where an unknown one was found."""
     model: Any = Config
@@ -343,17 +418,23 @@ VIEWS: dict[str, type[Section]] = {
     "constant": ConstantViewSettings,
     "frame": FrameViewSettings,
     "line": LineViewSettings,
+    "angles": AnglesViewSettings,
+    "obs": ObsViewSettings,
+    "mosaic": MosaicViewSettings,
+}
+SURFACES: dict[str, type[Section]] = {
     "flat": FlatSettings,
     "dsm": DsmSettings,
     "roof_planes": DsmSettings,
     "normals": NormalsSettings,
+    "obs": ObsSurfaceSettings,
 }
 
 
 def _inside(model: Any, part: Any) -> Any:
     """The model one step further down a location: a field, an item of a list, a kind of view or surface."""
-    if part in VIEWS and model is None:
-        return VIEWS[part]
+    if isinstance(model, dict):
+        return model.get(part)
     sections: dict[str, Any] = {
         "output": Output,
         "model": Model,
@@ -362,8 +443,9 @@ def _inside(model: Any, part: Any) -> Any:
         "materials": Materials,
         "scenes": Scene,
         "sun": Sun,
-        "view": None,
-        "surface": None,
+        "view": VIEWS,
+        "surface": SURFACES,
+        "truth": Truth,
         "settings": MaterialSettings,
     }
     return sections.get(part, model) if isinstance(part, str) else model

@@ -1,0 +1,197 @@
+"""The two loops over pixels that numpy is slow at: when a scanner passed, and vectors between raster pixels.
+
+Each result depends on its own pixel only, so it is the same however a scene is cut into blocks.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+TILE = 16
+"""pixels of a side of the tiles for which the possible samples are listed"""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def passes(x, y, z, seconds, table, candidates):
+    """When the scan plane of a trajectory went over each point, and where the sensor was: the nearest pass.
+
+    x, y, z    : float64 (rows, cols), points on the ground. [m]
+    seconds    : (samples,), ascending.
+    table      : (samples, 6), position and forward vector at each sample; linear in between.
+    candidates : int64, ascending: samples k such that the plane may pass a point between k and k + 1.
+
+    A plane passes a point when the point, ahead of it at sample k, is behind it or on it at k + 1.
+    Returns seconds (rows, cols), nan where no plane passes, and unit vectors (3, rows, cols), there up.
+    """
+    rows, cols = x.shape
+    when = np.empty((rows, cols))
+    vectors = np.empty((3, rows, cols))
+    near = np.empty(candidates.size, np.int64)
+    points = np.empty((3, TILE * TILE))
+    before, now, count = np.empty(TILE * TILE), np.empty(TILE * TILE), np.empty(TILE * TILE, np.int64)
+    passed = np.empty(TILE * TILE, np.int64)
+    for top in range(0, rows, TILE):
+        for left in range(0, cols, TILE):
+            bottom, right = min(top + TILE, rows), min(left + TILE, cols)
+            size = 0
+            for i in range(top, bottom):
+                for j in range(left, right):
+                    points[0, size], points[1, size], points[2, size] = x[i, j], y[i, j], z[i, j]
+                    size += 1
+            nears = _near_samples(points, size, table, candidates, near)
+            _count_passes(points, size, table, near, nears, (before, now, count, passed))
+            p = 0
+            for i in range(top, bottom):
+                for j in range(left, right):
+                    found = (math.nan, 0.0, 0.0, 1.0)
+                    point = (x[i, j], y[i, j], z[i, j])
+                    if count[p] == 1:
+                        found = _seen(point, seconds, table, passed[p])[:4]
+                    elif count[p] > 1:
+                        found = _nearest_pass(point, seconds, table, near, nears)
+                    when[i, j] = found[0]
+                    vectors[0, i, j], vectors[1, i, j], vectors[2, i, j] = found[1], found[2], found[3]
+                    p += 1
+    return when, vectors
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _near_samples(points, size, table, candidates, near):
+    """The candidates whose planes may pass the box around the first points of a tile, into `near`; how many."""
+    middle, half = np.empty(3), np.empty(3)
+    for c in range(3):
+        low, high = points[c, 0], points[c, 0]
+        for p in range(size):
+            value = points[c, p]
+            low = value if value < low else low
+            high = value if value > high else high
+        middle[c], half[c] = (low + high) / 2, (high - low) / 2 + 1e-6
+    count = 0
+    for k in candidates:
+        if _ahead(middle, table, k) + _reach(half, table, k) <= 0:
+            continue
+        if _ahead(middle, table, k + 1) - _reach(half, table, k + 1) > 0:
+            continue
+        near[count] = k
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_passes(points, size, table, near, nears, scratch):
+    """How often each point of a tile is passed, and after which sample the last time."""
+    before, now, count, passed = scratch
+    for p in range(size):
+        count[p] = 0
+    last = -1
+    for n in range(nears):
+        k = near[n]
+        if k != last:
+            _ahead_of_all(points, size, table, k, before)
+        last = k + 1
+        _ahead_of_all(points, size, table, last, now)
+        for p in range(size):
+            passes_now = (before[p] > 0) & (now[p] <= 0)
+            count[p] += passes_now
+            passed[p] = k if passes_now else passed[p]
+            before[p] = now[p]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ahead_of_all(points, size, table, k, ahead):
+    """`_ahead` of the first points of a tile, in the same order of arithmetic."""
+    x, y, z = table[k, 0], table[k, 1], table[k, 2]
+    east, north, up = table[k, 3], table[k, 4], table[k, 5]
+    for p in range(size):
+        ahead[p] = (points[0, p] - x) * east + (points[1, p] - y) * north + (points[2, p] - z) * up
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ahead(point, table, k):
+    """How far a point lies ahead of the scan plane of sample k. [m]"""
+    return (
+        (point[0] - table[k, 0]) * table[k, 3]
+        + (point[1] - table[k, 1]) * table[k, 4]
+        + (point[2] - table[k, 2]) * table[k, 5]
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reach(half, table, k):
+    """How much farther ahead than its middle a box of these half sides reaches. [m]"""
+    return half[0] * abs(table[k, 3]) + half[1] * abs(table[k, 4]) + half[2] * abs(table[k, 5])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest_pass(point, seconds, table, near, nears):
+    """`_seen` of the pass over a point that was nearest; of the earliest, where two were equally near."""
+    found, least = (math.nan, 0.0, 0.0, 1.0), math.inf
+    for n in range(nears):
+        k = near[n]
+        if _ahead(point, table, k) > 0 and _ahead(point, table, k + 1) <= 0:
+            time, east, north, up, distance = _seen(point, seconds, table, k)
+            if distance < least:
+                found, least = (time, east, north, up), distance
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _seen(point, seconds, table, k):
+    """When a point was passed between samples k and k + 1, the unit vector to the sensor then, and its distance.
+
+    In between, (point - position) . forward is a parabola ahead + slope s + bend s^2 with one root of falling sign.
+    """
+    ahead, behind = _ahead(point, table, k), _ahead(point, table, k + 1)
+    bend = 0.0
+    for c in range(3):
+        bend -= (table[k + 1, c] - table[k, c]) * (table[k + 1, c + 3] - table[k, c + 3])
+    slope = behind - ahead - bend
+    root = math.sqrt(max(slope * slope - 4 * bend * ahead, 0.0))
+    s = min(2 * ahead / (root - slope), 1.0)
+    east = table[k, 0] + s * (table[k + 1, 0] - table[k, 0]) - point[0]
+    north = table[k, 1] + s * (table[k + 1, 1] - table[k, 1]) - point[1]
+    up = table[k, 2] + s * (table[k + 1, 2] - table[k, 2]) - point[2]
+    distance = math.sqrt(east * east + north * north + up * up)
+    time = seconds[k] + s * (seconds[k + 1] - seconds[k])
+    return time, east / distance, north / distance, up / distance, distance
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bilinear_unit(source, rows, cols, turn):
+    """Unit vectors between the pixels of a raster of vectors, turned from true north to the grid's axes.
+
+    source     : float64 (3, rows, cols), unit vectors east, north, up; of length 0 where there is none.
+    rows, cols : (height, width), fractional places in `source`; the centre of its first pixel is (0, 0).
+    turn       : (2, height, width), sine and cosine of the meridian convergence.
+
+    Up to half a pixel outside the outer centres the outer pixel holds. Returns (3, height, width), of length 0
+    where no vector is near: outside, and where less than a quarter of the weight falls on pixels that have one.
+    """
+    last_row, last_col = source.shape[1] - 1, source.shape[2] - 1
+    height, width = rows.shape
+    result = np.zeros((3, height, width))
+    for i in range(height):
+        for j in range(width):
+            row, col = rows[i, j], cols[i, j]
+            if not (-0.501 <= row <= last_row + 0.501 and -0.501 <= col <= last_col + 0.501):
+                continue
+            row, col = min(max(row, 0.0), last_row), min(max(col, 0.0), last_col)
+            top, left = int(row), int(col)
+            bottom, right = min(top + 1, last_row), min(left + 1, last_col)
+            down, across = row - top, col - left
+            nw, ne = (1 - down) * (1 - across), (1 - down) * across
+            sw, se = down * (1 - across), down * across
+            east, north, up = 0.0, 0.0, 0.0
+            for weight, r, c in ((nw, top, left), (ne, top, right), (sw, bottom, left), (se, bottom, right)):
+                east += weight * source[0, r, c]
+                north += weight * source[1, r, c]
+                up += weight * source[2, r, c]
+            length = math.sqrt(east * east + north * north + up * up)
+            if length < 0.2499:
+                continue
+            sine, cosine = turn[0, i, j], turn[1, i, j]
+            result[0, i, j] = (east * cosine - north * sine) / length
+            result[1, i, j] = (east * sine + north * cosine) / length
+            result[2, i, j] = up / length
+    return result
