@@ -7,7 +7,8 @@ the data, no fastmath (so nan keeps its meaning and every instruction set gives 
 instead of library calls.
 
 Constants are np.float32 so that float32 arithmetic stays float32; all but the polynomials' are exact.
-Compiled once for float32 vectors (`precision = "fast"`) and once for float64 ("exact").
+Compiled once for tables of float32 (`precision = "fast"`) and once for float64 ("exact"). Directions are float64 in
+both: near grazing, where sun and view nearly cancel, float32 would lose the facet tilt.
 This module imports nothing of ours: numba's cache does not see edits in other files.
 """
 
@@ -200,13 +201,13 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
                they hold; on exit all bits of PixelFlag. Shadow and view bits are cleared where no material
                has a peak, since there nobody looked.
     material : uint8 (rows, cols), rows of `table`; 0 is no material.
-    sun, view, normal : unit vectors, float (3, rows, cols), or (3, 1, 1) where constant; all of one type.
+    sun, view, normal : unit vectors, float64 (3, rows, cols), or (3, 1, 1) where constant.
     options  : int64 (4,): exact, skip, first row of the block in the image, tally every so many rows.
     """
     bands, rows, cols = image.shape
     exact, skip, first_row, stride = options[0] != 0, options[1] != 0, options[2], options[3]
     want_removed = removed.shape[1] == rows
-    real = sun.dtype
+    real = table.gain.dtype
     peak, states = table.peak, tally.states  # taken out of their tuples once: each access costs a reference count
     cos_min_of, cos_max_of, negligible_of, limit_of = table.cos_min, table.cos_max, table.negligible, table.share
     bound_of, simplified_of, horizontal_of = table.bound, table.simplified, table.horizontal
@@ -217,7 +218,7 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
     has_nodata, dodges, integer = rules.has_nodata, rules.dodge, rules.integer
 
     present = np.zeros(peak.size, np.bool_)
-    fixed = np.zeros((9, CHUNK), real)
+    fixed = np.zeros((9, CHUNK), np.float64)
     kind, missing, saturated = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
     assess, hit, state = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
     clipped, policy = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
@@ -229,6 +230,7 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
     negligible, limit, bound = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
     shape, w2, exponential = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
     lobe, share, new_values = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
+    sun_up = np.zeros(CHUNK, real)
     amount = np.zeros((bands, CHUNK), real)
     if rows * cols > 0:
         _set_constants(fixed, sun, view, normal)
@@ -271,7 +273,7 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
                 _line(normal, fixed, 7, row, start, stop),
                 _line(normal, fixed, 8, row, start, stop),
             )
-            _cosines(cos_i, cos_r, cos_l, alpha2, sx, sy, sz, vx, vy, vz, nx, ny, nz)
+            _cosines(cos_i, cos_r, cos_l, alpha2, sun_up, sx, sy, sz, vx, vy, vz, nx, ny, nz)
 
             # The rules of each pixel's material, and whether it can be assessed.
             _clear(assess)
@@ -290,7 +292,9 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
             assessed = _assess(assess, cos_min, cos_max, cos_i, cos_r, marks)
             inside = assessed > 0
             if inside:
-                tally.attenuated[0] += _set_shape(assess, simplified, horizontal, cos_i, cos_r, cos_l, shape, sz)
+                tally.attenuated[0] += _set_shape(
+                    assess, simplified, horizontal, cos_i, cos_r, cos_l, shape, sun_up, count
+                )
 
             # The reflectance to remove in each band; bands with the same w, n, k share the lobe. A chunk is out of
             # the lobe if the largest pi beta t1 F times the exponential stays below the threshold everywhere.
@@ -430,19 +434,20 @@ def _mark(marks, kind, missing, saturated, q32, peak, states):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cosines(cos_i, cos_r, cos_l, alpha2, sx, sy, sz, vx, vy, vz, nx, ny, nz):
+def _cosines(cos_i, cos_r, cos_l, alpha2, sun_up, sx, sy, sz, vx, vy, vz, nx, ny, nz):
     """Directions to angles about the facet; alpha^2 by a polynomial in |n - h|^2 / 2 = 1 - cos alpha."""
     for j in range(sx.size):
         hx, hy, hz = sx[j] + vx[j], sy[j] + vy[j], sz[j] + vz[j]
-        length = cos_l.dtype.type(math.sqrt(hx * hx + hy * hy + hz * hz))
-        inverse = ONE / length
+        length = math.sqrt(hx * hx + hy * hy + hz * hz)
+        inverse = 1.0 / length
         dx, dy, dz = nx[j] - hx * inverse, ny[j] - hy * inverse, nz[j] - hz * inverse
-        u = (dx * dx + dy * dy + dz * dz) * HALF
+        u = alpha2.dtype.type((dx * dx + dy * dy + dz * dz) * 0.5)
         high = (((A8 * u + A7) * u + A6) * u + A5) * u + A4
         alpha2[j] = ((((high * u + A3) * u + A2) * u + A1) * u + A0) * u
         cos_i[j] = nx[j] * sx[j] + ny[j] * sy[j] + nz[j] * sz[j]
         cos_r[j] = nx[j] * vx[j] + ny[j] * vy[j] + nz[j] * vz[j]
-        cos_l[j] = length * HALF
+        cos_l[j] = length * 0.5
+        sun_up[j] = sz[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -483,10 +488,10 @@ def _assess(assess, cos_min, cos_max, cos_i, cos_r, marks):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _set_shape(assess, simplified, horizontal, cos_i, cos_r, cos_l, shape, sz):
+def _set_shape(assess, simplified, horizontal, cos_i, cos_r, cos_l, shape, sun_up, count):
     """G / (cos_i cos_r), on the plane that R refers to; finite at grazing angles. The number of pixels with G < 1."""
     attenuated = 0
-    for j in range(sz.size):
+    for j in range(count):
         good = assess[j] != 0
         least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
         most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
@@ -499,7 +504,7 @@ def _set_shape(assess, simplified, horizontal, cos_i, cos_r, cos_l, shape, sz):
         denominator = cos_i[j] * cos_r[j] if whole else most * c2
         level = horizontal[j] != 0
         numerator = numerator * (cos_i[j] if level else ONE)
-        denominator = denominator * (sz[j] if level else ONE)
+        denominator = denominator * (sun_up[j] if level else ONE)
         shape[j] = (numerator if good else ZERO) / (denominator if good else ONE)
     return attenuated
 
@@ -593,7 +598,7 @@ def _subtract(amounts, line, new_values, state, policy, clipped, steps, lowest, 
             new_values[j] = real.type(np.int32(step if step < MOST_STEPS else MOST_STEPS))
     else:
         for j in range(line.size):
-            new_values[j] = np.float32(amounts[j] * steps)  # so that input - removed is exact in the file
+            new_values[j] = line.dtype.type(amounts[j] * steps)  # so that input - removed is exact in the file
     for j in range(line.size):
         value = real.type(line[j])
         new = value - new_values[j]

@@ -143,9 +143,9 @@ def specular(geometry: Geometry, w: Array, n: Array, k: Array, *, simplified: bo
     """
     cos_i, cos_r, cos_l, alpha = geometry
     above = (cos_i > 0) & (cos_r > 0)
-    product = np.where(above, cos_i * cos_r, np.nan)
+    cos_i, cos_r, cos_l = (np.where(above, cosine, np.nan) for cosine in (cos_i, cos_r, cos_l))
     g = 1 if simplified else attenuation(cos_i, cos_r, cos_l)
-    return fresnel(cos_l, n, k) / product * g * facet_distribution(alpha, w)
+    return fresnel(cos_l, n, k) / (cos_i * cos_r) * g * facet_distribution(alpha, w)
 
 
 def brdf(f_spec: Array, t0: Array, t1: Array) -> Array:
@@ -283,7 +283,7 @@ def _share(amount: Array, reflectance: Array) -> Array:
 def _subtract(values: Array, amount: Array, rules: Any) -> tuple[Array, Array]:
     """Stored values less the amount, rounded to stored steps and held above 0; and where they were held."""
     steps = amount * rules.steps[:, None]
-    new = values - (np.floor(steps + 0.5) if rules.integer else steps.astype(np.float32))
+    new = values - (np.floor(steps + 0.5) if rules.integer else steps.astype(rules.nodata.dtype))
     lowest = rules.lowest[:, None]
     low = new < lowest
     new = np.where(low, np.minimum(values, lowest), new)

@@ -93,7 +93,7 @@ class Corrector:
         self.skip = skip
         self.tally_stride = tally_stride
         self._pixels = pixel_rules(stored)
-        precisions = [computed_precision(*entry) for entry in materials]
+        precisions = [computed_precision(parameters, rules) for _, parameters, rules in materials]
         self._engines = [
             self._engine(precision, np.array([False, *(own == precision for own in precisions)]), materials, stored)
             for precision in sorted(set(precisions)) or ["fast"]
@@ -153,9 +153,9 @@ class Corrector:
             removed,
             flags,
             np.ascontiguousarray(inputs.material),
-            np.ascontiguousarray(inputs.sun, real),
-            np.ascontiguousarray(inputs.view, real),
-            np.ascontiguousarray(inputs.normal, real),
+            np.ascontiguousarray(inputs.sun, np.float64),
+            np.ascontiguousarray(inputs.view, np.float64),
+            np.ascontiguousarray(inputs.normal, np.float64),
             engine.table,
             self._pixels[np.dtype(real)],
             tally,

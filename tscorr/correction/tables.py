@@ -50,20 +50,17 @@ def pixel_rules(stored: Stored) -> dict[np.dtype[Any], kernels.PixelRules]:
     }
 
 
-def computed_precision(surface: Material, parameters: BandParameters, rules: Rules) -> str:
+def computed_precision(parameters: BandParameters, rules: Rules) -> str:
     """The precision of the rules, but "exact" where float32 cannot keep the promise of "fast".
 
-    A direction in float32 is unsure by about 1e-7, the facet tilt by 1 / cos theta_l times as much, since sun and
-    view nearly cancel at grazing angles, and a narrow lobe turns that into reflectance in proportion to w.
-    Where all light is reflected beyond a critical angle (n < 1, hardly absorbing), F has a kink there.
-    The limits are searched: see `tscorr bench`, which fails where "fast" errs by more than it says.
+    Where all light is reflected beyond a critical angle (n < 1, hardly absorbing), F has a kink there, which
+    a cosine in float32 misses. The limits are searched: see `tscorr bench`, which fails where "fast" errs by more
+    than it says.
     """
     if rules.precision != "fast":
         return rules.precision
-    cos_least = _cosine(_steepest(surface, rules))
-    narrow = parameters.w * (2 * cos_least + 1) > cos_least
-    kinked = (parameters.n < 1) & (parameters.k < 0.05)
-    return "exact" if np.any((parameters.t1 > 0) & (narrow | kinked)) else "fast"
+    kinked = (parameters.t1 > 0) & (parameters.n < 1) & (parameters.k < 0.05)
+    return "exact" if np.any(kinked) else "fast"
 
 
 def material_table(materials: Sequence[Entry], bands: int, real: type[np.floating[Any]]) -> kernels.MaterialTable:
