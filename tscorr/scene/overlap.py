@@ -1,0 +1,153 @@
+"""How much two scenes of the same ground differ, before and after the correction.
+
+The accepted measure on real data, where no truth is known. Looked at in windows spread over the overlap, so that
+the cost is bounded whatever the size of the images.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tscorr import rasters
+from tscorr.correction import PixelFlag, SpecularState, class_rows, specular_state
+from tscorr.errors import InputError
+from tscorr.grid import Block, Grid, reproject
+from tscorr.report import Difference, Overlap
+from tscorr.scene.plan import Scene
+
+Array = NDArray[Any]
+
+MOST_PAIRS = 24
+"""overlaps that are looked at: those with the most pixels"""
+WINDOWS = 4
+"""windows along each side of an overlap"""
+WINDOW_PX = 128
+UNKNOWN = int(SpecularState.NOT_ASSESSED) << 6
+"""flags where a scene does not reach"""
+
+
+def overlaps(results: Sequence[tuple[Scene, Path]]) -> list[Overlap]:
+    """The differences of scenes that share ground, each given with the folder of its result.
+
+    Scenes of other bands, or whose results lack corrected.tif or flags.tif, are not compared.
+    """
+    whole = [(scene, folder) for scene, folder in results if _layers(folder) is not None]
+    shared = [
+        (region, one, two)
+        for one, two in combinations(whole, 2)
+        if one[0].wavelengths_um == two[0].wavelengths_um
+        and one[0].image.bands == two[0].image.bands
+        and (region := common_region(one[0].grid, two[0].grid)) is not None
+    ]
+    shared.sort(key=lambda pair: -pair[0].height * pair[0].width)
+    return [difference(one, two, region) for region, one, two in shared[:MOST_PAIRS]]
+
+
+def _layers(folder: Path) -> tuple[Path, Path] | None:
+    files = folder / "corrected.tif", folder / "flags.tif"
+    return files if all(file.exists() for file in files) else None
+
+
+def common_region(grid: Grid, other: Grid) -> Block | None:
+    """The block of a grid that bounds what another covers; None where they share nothing, or have no common CRS."""
+    if grid.crs != other.crs and (grid.crs is None or other.crs is None):
+        return None
+    x, y = other.corners() if grid.crs == other.crs else reproject(other.crs, grid.crs, *other.corners())
+    rows, cols = grid.rowcol(x, y)
+    if not np.isfinite([rows, cols]).all():
+        return None
+    top, left = max(0, int(np.ceil(rows.min()))), max(0, int(np.ceil(cols.min())))
+    bottom, right = min(grid.shape[0], int(rows.max()) + 1), min(grid.shape[1], int(cols.max()) + 1)
+    return Block(top, left, bottom - top, right - left) if top < bottom and left < right else None
+
+
+def windows(region: Block) -> Iterator[Block]:
+    """At most `WINDOWS` x `WINDOWS` windows, spread over a region; all of a small one."""
+    down, right = (max(WINDOW_PX, -(-size // WINDOWS)) for size in region.shape)
+    for row in range(0, region.height, down):
+        for col in range(0, region.width, right):
+            height, width = min(WINDOW_PX, region.height - row), min(WINDOW_PX, region.width - col)
+            yield Block(region.row + row, region.col + col, height, width)
+
+
+def difference(one: tuple[Scene, Path], two: tuple[Scene, Path], region: Block) -> Overlap:
+    """The differences of two scenes in a region of the first one's grid, material by material as it knows them.
+
+    Over pixels assessed in both and corrected in at least one, neither saturated nor beyond correction.
+    """
+    first = one[0]
+    size = len(first.materials) + 1
+    count, before, after = np.zeros(size, np.int64), np.zeros(size), np.zeros(size)
+    with ExitStack() as files:
+        classes = files.enter_context(first.classes())
+        seen = [_Seen(scene, folder, first.grid, files) for scene, folder in (one, two)]
+        for window in windows(region):
+            rows = class_rows(classes.read(window, 1), first.rows)
+            flags = [scene.flags(window) for scene in seen]
+            use = comparable(*flags) & (rows > 0)
+            if not use.any():
+                continue
+            mine = rows[use]
+            count += np.bincount(mine, minlength=size)
+            before += np.bincount(mine, _squares(seen, "image", window, use), size)
+            after += np.bincount(mine, _squares(seen, "corrected", window, use), size)
+    return Overlap(
+        first.name,
+        two[0].name,
+        {
+            material.name: Difference(
+                int(count[row]), float(np.sqrt(before[row] / count[row])), float(np.sqrt(after[row] / count[row]))
+            )
+            for row, (material, *_) in enumerate(first.materials, start=1)
+            if count[row]
+        },
+    )
+
+
+def _squares(seen: Sequence["_Seen"], layer: str, window: Block, use: Array) -> Array:
+    """Squared difference of two scenes, mean over the bands, at the pixels to use: (pixels,)."""
+    one, two = (scene.reflectance(layer, window)[:, use] for scene in seen)
+    return ((one - two) ** 2).mean(axis=0)
+
+
+def comparable(one: Array, two: Array) -> Array:
+    """Pixels whose flags allow a comparison."""
+    use = np.zeros(one.shape, np.bool_)
+    for flags in (one, two):
+        use |= specular_state(flags) == SpecularState.CORRECTED
+    for flags in (one, two):
+        state = specular_state(flags)
+        use &= (state == SpecularState.NEGLIGIBLE) | (state == SpecularState.CORRECTED)
+        use &= flags & PixelFlag.SATURATED == 0
+    return use
+
+
+class _Seen:
+    """The layers of one scene, laid over a grid."""
+
+    def __init__(self, scene: Scene, folder: Path, grid: Grid, files: ExitStack) -> None:
+        layers = _layers(folder)
+        if layers is None:
+            raise InputError(f"{folder} holds no corrected.tif and flags.tif to compare")
+        corrected, flags = map(rasters.describe, layers)
+        self._layers = {
+            "image": files.enter_context(rasters.Reader(scene.image, grid)),
+            "corrected": files.enter_context(rasters.Reader(corrected, grid)),
+        }
+        self._flags = files.enter_context(rasters.Reader(flags, grid, fill=UNKNOWN))
+        self._scale, self._offset = (
+            np.array(values)[:, None, None] for values in (scene.stored.scale, scene.stored.offset)
+        )
+
+    def flags(self, block: Block) -> Array:
+        """Flags (rows, cols)."""
+        return self._flags.read(block, 1)
+
+    def reflectance(self, layer: str, block: Block) -> Array:
+        """Reflectance factor (bands, rows, cols) of "image" or "corrected"."""
+        return self._layers[layer].read(block) * self._scale + self._offset
