@@ -27,9 +27,7 @@ def roof_polygons(path):
     for name, item in model["CityObjects"].items():
         owner = item.get("parents", [name])[0]
         for geometry in item.get("geometry", []):
-            boundaries = (
-                geometry["boundaries"] if geometry["type"] == "MultiSurface" else geometry["boundaries"][0]
-            )
+            boundaries = geometry["boundaries"] if geometry["type"] == "MultiSurface" else geometry["boundaries"][0]
             values = geometry["semantics"]["values"]
             values = values if geometry["type"] == "MultiSurface" else values[0]
             for rings, kind in zip(boundaries, values, strict=True):

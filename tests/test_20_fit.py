@@ -154,9 +154,7 @@ def test_errors_and_conditions_are_those_of_the_independent_study():
         sigma = np.sqrt(np.diag(result.formal_covariances[0])) / truth(name)[:4]
         np.testing.assert_allclose(sigma[1:], (t1, w, n), rtol=0.1, atol=0.0006, err_msg=name)
         true, steps = truth(name), 1e-6 * np.diag(truth(name))[:4]
-        jacobian = [
-            (brdf(true + d, angles) - brdf(true - d, angles)) / (2 * d.sum() * NOISE * f_r) for d in steps
-        ]
+        jacobian = [(brdf(true + d, angles) - brdf(true - d, angles)) / (2 * d.sum() * NOISE * f_r) for d in steps]
         covariance = np.linalg.inv(np.array(jacobian) @ np.array(jacobian).T)
         np.testing.assert_allclose(result.formal_covariances[0], covariance, rtol=1e-4)
         assert result.condition == pytest.approx(condition, rel=0.1), name
@@ -624,9 +622,7 @@ def test_named_files_are_one_material(tmp_path):
     f_r = brdf(truth("red_concrete"), angles)
     low = theta_i < 40
     parts = [
-        written(
-            tmp_path, csv_of(angles[:, half], {"f_r": f_r[half], "sigma": NOISE * f_r[half]}), f"{name}.csv"
-        )
+        written(tmp_path, csv_of(angles[:, half], {"f_r": f_r[half], "sigma": NOISE * f_r[half]}), f"{name}.csv")
         for name, half in (("a", low), ("b", ~low))
     ]
     fitted = fit_files(parts, name="tile")

@@ -25,18 +25,14 @@ def plane(shape, slope_deg, aspect_deg, cell_x_m, cell_y_m):
 
 @pytest.mark.parametrize(("method", "options"), METHODS)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize(
-    ("slope_deg", "aspect_deg"), [(0, 0), (10, 0), (35, 90), (35, 213), (60, 300), (75, 45)]
-)
+@pytest.mark.parametrize(("slope_deg", "aspect_deg"), [(0, 0), (10, 0), (35, 90), (35, 213), (60, 300), (75, 45)])
 def test_a_plane_gives_its_normal_up_to_the_border(method, options, dtype, slope_deg, aspect_deg):
     heights, normal = plane((12, 17), slope_deg, aspect_deg, **CELLS)
     result = method(heights.astype(dtype), **CELLS, **options, step_m=0.5)
     assert result.normals.dtype == np.float32
     assert result.normals.flags.c_contiguous
     tolerance = 2e-5 if dtype is np.float32 else 3e-7  # heights of 20 m in float32 step by 2e-6 m
-    np.testing.assert_allclose(
-        result.normals, np.broadcast_to(normal[:, None, None], (3, 12, 17)), atol=tolerance
-    )
+    np.testing.assert_allclose(result.normals, np.broadcast_to(normal[:, None, None], (3, 12, 17)), atol=tolerance)
     np.testing.assert_allclose(np.linalg.norm(result.normals.astype(float), axis=0), 1, atol=3e-7)
     assert not result.unreliable.any()
 

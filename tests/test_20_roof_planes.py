@@ -60,9 +60,7 @@ def test_a_gable_keeps_both_faces_up_to_the_ridge(dtype, noise_m, slope_deg):
 def test_a_valley_is_kept_as_a_ridge_is():
     heights, truth, distance = gable()
     heights, truth = 60 - heights, truth * [[[-1]], [[-1]], [[1]]]
-    result = roof_planes(
-        heights + np.random.default_rng(2).normal(0, 0.03, heights.shape), **CELLS, noise_m=0.03
-    )
+    result = roof_planes(heights + np.random.default_rng(2).normal(0, 0.03, heights.shape), **CELLS, noise_m=0.03)
     assert angle_deg(result.normals.astype(float), truth)[distance > 0.03].max() < 0.15
 
 
@@ -126,9 +124,7 @@ def test_sigma_is_the_scatter_of_the_normals(slope_deg, aspect_deg):
     truth = np.array([np.sin(slope) * np.sin(aspect), np.sin(slope) * np.cos(aspect), np.cos(slope)])
     rows, cols = np.indices((9, 22))
     plane = -(truth[0] * cols * 0.5 - truth[1] * rows * 0.8) / truth[2]
-    plane[abs(cols - 1.5 * rows - 5) > 4] = (
-        np.nan
-    )  # a slanting face: the errors of the two slopes go together
+    plane[abs(cols - 1.5 * rows - 5) > 4] = np.nan  # a slanting face: the errors of the two slopes go together
     errors, sigmas = [], []
     for _ in range(300):
         heights = plane + rng.normal(0, 0.03, plane.shape)
@@ -212,9 +208,7 @@ def test_real_roofs(cell_m, noise_m, limit_deg):
     for surfaces in roof_polygons(Path(os.environ["TSCORR_TEST_DATA"]) / "cityjson/zurich_subset_lod2.json"):
         raster = rasterise(surfaces, cell_m)
         heights = raster.heights + rng.normal(0, noise_m, raster.heights.shape)
-        normals = roof_planes(
-            heights.astype(np.float32), cell_x_m=cell_m, cell_y_m=cell_m, noise_m=noise_m
-        ).normals
+        normals = roof_planes(heights.astype(np.float32), cell_x_m=cell_m, cell_y_m=cell_m, noise_m=noise_m).normals
         large = (raster.faces > 0) & (raster.areas[raster.faces] > 10)
         errors.append(angle_deg(normals.astype(float), raster.normals)[large])
     assert np.median(np.concatenate(errors)) < limit_deg

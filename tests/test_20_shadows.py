@@ -102,9 +102,7 @@ def exact_look():
 def fine_march(heights, look, toward, cell_m, step_m):
     """From the definition: free if no point of the ray above the map is under the surface `look`."""
     row, col = (x.ravel().astype(float) for x in np.indices(heights.shape))
-    toward = np.broadcast_to(
-        np.asarray(toward).reshape(3, *(np.shape(toward)[1:] or (1, 1))), (3, *heights.shape)
-    )
+    toward = np.broadcast_to(np.asarray(toward).reshape(3, *(np.shape(toward)[1:] or (1, 1))), (3, *heights.shape))
     east, north, up = (toward / np.maximum(np.hypot(toward[0], toward[1]), 1e-9)).reshape(3, -1)
     eye, top = heights.ravel().astype(float) + 1e-3, heights.max()
     free, going = np.ones(row.size, bool), np.arange(row.size)
@@ -241,9 +239,7 @@ def test_delft_line(delft, surface):
 # -- closed forms
 
 
-@pytest.mark.parametrize(
-    ("azimuth_deg", "row_step", "col_step"), [(180, -1, 0), (0, 1, 0), (90, 0, -1), (270, 0, 1)]
-)
+@pytest.mark.parametrize(("azimuth_deg", "row_step", "col_step"), [(180, -1, 0), (0, 1, 0), (90, 0, -1), (270, 0, 1)])
 @pytest.mark.parametrize("cells", [(0.5, 0.5), (0.4, 1.0), (2.0, 0.5)])
 def test_a_tower_in_the_sun_casts_its_shadow_away_from_it(azimuth_deg, row_step, col_step, cells):
     """In words: the sun in the south, the shadow in the north, as long as height times tan(zenith)."""

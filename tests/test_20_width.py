@@ -47,17 +47,13 @@ def f_spec(shape, incidence, exitance, phi, form="full"):
     return reference.specular(geometry, shape.w, shape.n, shape.k, simplified=form == "simplified")
 
 
-shapes = st.builds(
-    LobeShape, w=st.floats(0.02, 50), n=st.floats(1.01, 3), k=st.one_of(st.just(0.0), st.floats(0, 4))
-)
+shapes = st.builds(LobeShape, w=st.floats(0.02, 50), n=st.floats(1.01, 3), k=st.one_of(st.just(0.0), st.floats(0, 4)))
 
 
 # --- the 50-digit values ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "row", PAPER["widths"], ids=lambda r: f"{r['material']}-{r['theta_i']}-{r['theta_r']}"
-)
+@pytest.mark.parametrize("row", PAPER["widths"], ids=lambda r: f"{r['material']}-{r['theta_i']}-{r['theta_r']}")
 def test_widths_equal_the_50_digit_values(row):
     m, incidence, exitance = material(row["material"]), float(row["theta_i"]), float(row["theta_r"])
     widths = {
@@ -151,9 +147,7 @@ def test_width_is_where_the_reference_has_half_its_value(shape, incidence, shift
 @given(shapes, st.floats(0.01, 89.9), st.floats(0.01, 89.9), st.sampled_from(FORMS))
 @settings(max_examples=100, deadline=None)
 def test_width_is_reciprocal(shape, incidence, exitance, form):
-    there, back = (
-        azimuthal_width(shape, *pair, form) for pair in ((incidence, exitance), (exitance, incidence))
-    )
+    there, back = (azimuthal_width(shape, *pair, form) for pair in ((incidence, exitance), (exitance, incidence)))
     assert there == pytest.approx(back, rel=1e-9, nan_ok=True)
 
 
@@ -302,11 +296,7 @@ def test_no_crossover_without_a_peak_or_with_one_as_broad_as_the_sky():
 @pytest.mark.parametrize(
     "shape",
     [lobe_shape(material(name)) for name in PEAKED]
-    + [
-        LobeShape(w=w, n=n, k=k)
-        for w in (0.02, 0.4, 20.0)
-        for n, k in ((1.0001, 0.0), (0.2, 3.0), (6.0, 0.0))
-    ],
+    + [LobeShape(w=w, n=n, k=k) for w in (0.02, 0.4, 20.0) for n, k in ((1.0001, 0.0), (0.2, 3.0), (6.0, 0.0))],
     ids=lambda s: f"w{s.w}-n{s.n}",
 )
 def test_table_errs_by_less_than_it_says(shape, form):
@@ -340,9 +330,7 @@ def test_table_has_the_edge_where_the_width_has_it(name):
 
 
 def test_table_keeps_shape_and_type_and_nan():
-    widths = WidthTable(material("red_concrete")).at(
-        np.array([[0, 30, 89.9], [90, np.nan, -5]], dtype=np.float32)
-    )
+    widths = WidthTable(material("red_concrete")).at(np.array([[0, 30, 89.9], [90, np.nan, -5]], dtype=np.float32))
     assert widths.dtype == np.float32
     assert np.isnan(widths).tolist() == [[True, False, False], [True, True, True]]
 
@@ -370,17 +358,13 @@ def largest_inside(rng, boxes, w, n, k, *, simplified):
     lattice = np.stack(np.meshgrid(*[[0, 0.5, 1]] * 3, indexing="ij")).reshape(3, 27, 1)
     count = len(boxes[0][0])
     share = np.concatenate([np.repeat(lattice, count, 2), rng.uniform(size=(3, 60, count))], axis=1)
-    angles = [
-        np.minimum(low + (high - low) * part, high) for (low, high), part in zip(boxes, share, strict=True)
-    ]
+    angles = [np.minimum(low + (high - low) * part, high) for (low, high), part in zip(boxes, share, strict=True)]
     geometry = reference.geometry_from_angles(*angles)
     return reference.specular(geometry, w, n, k, simplified=simplified).max(axis=0)
 
 
 @pytest.mark.parametrize("simplified", [False, True])
-@pytest.mark.parametrize(
-    ("size_deg", "median"), [(0.0, 1.0001), (1.0, 1.15), (2.0, 1.3), (5.0, 1.8), (10.0, 2.8)]
-)
+@pytest.mark.parametrize(("size_deg", "median"), [(0.0, 1.0001), (1.0, 1.15), (2.0, 1.3), (5.0, 1.8), (10.0, 2.8)])
 def test_no_value_in_a_block_exceeds_its_bound_and_the_bound_is_tight(size_deg, median, simplified):
     rng = np.random.default_rng(20)
     boxes = random_boxes(rng, 3000, size_deg)
@@ -468,9 +452,7 @@ def test_rows_are_the_widths_with_none_for_nan():
 
 def unit(zenith, azimuth):
     zenith, azimuth = math.radians(zenith), math.radians(azimuth)
-    return np.array(
-        [math.sin(zenith) * math.sin(azimuth), math.sin(zenith) * math.cos(azimuth), math.cos(zenith)]
-    )
+    return np.array([math.sin(zenith) * math.sin(azimuth), math.sin(zenith) * math.cos(azimuth), math.cos(zenith)])
 
 
 def test_critical_roof_mirrors_the_sun_into_the_camera():

@@ -182,9 +182,7 @@ def test_only_used_bands_need_to_be_read():
     image = rng.random((5, 4, 6), dtype=np.float32)
     matrix = quicklook.rgb_matrix(DELFT_UM)
     used = quicklook.used_bands(matrix)
-    np.testing.assert_array_equal(
-        quicklook.linear_rgb(image[used], matrix[used]), quicklook.linear_rgb(image, matrix)
-    )
+    np.testing.assert_array_equal(quicklook.linear_rgb(image[used], matrix[used]), quicklook.linear_rgb(image, matrix))
 
 
 def test_exposure_leaves_the_brightest_two_percent_to_clip():
@@ -227,9 +225,7 @@ def test_flag_colours_differ_for_all_eyes():
 def sheet(tmp_path, shape, title="Delft"):
     before = np.full((*shape, 3), 0.3, np.float32) * np.array([1.0, 0.8, 0.6], np.float32)
     path = tmp_path / "sheet.png"
-    quicklook.before_after(
-        before, before / 2, np.full(shape, 2 << 6, np.uint16), path, title=title, exposure=1.0
-    )
+    quicklook.before_after(before, before / 2, np.full(shape, 2 << 6, np.uint16), path, title=title, exposure=1.0)
     picture = imread(path)
     return before, picture
 

@@ -1,17 +1,20 @@
 """Many scenes: plan all, then correct one after the other; resume what is done, go on where one fails."""
 
-import html
 import json
 import logging
+import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tscorr import __version__, config, publish
+from tscorr import __version__, config, publish, stac
 from tscorr.errors import ConfigError, InputError, TscorrError, nearest
 from tscorr.materials import Material, builtin_materials, find, load_materials
+from tscorr.report import Difference, Overlap, SceneLine, batch_page
 from tscorr.scene.correct import correct_scene, resume_key, target_of
+from tscorr.scene.overlap import overlaps
 from tscorr.scene.plan import Scene, plan_scene
 from tscorr.scene.run import silent
 
@@ -112,10 +115,31 @@ def run(
         settings = settings.model_copy(update={"run": settings.run.model_copy(update={"workers": workers})})
     planned = plan(settings, scenes, materials)
     folder = Path(settings.output.directory)
-    outcomes = tuple(_outcomes(planned, overwrite, progress))
-    result = BatchResult(folder, outcomes)
-    _write_overview(settings, result)
+    with _log_file(folder):
+        result = BatchResult(folder, tuple(_outcomes(planned, overwrite, progress)))
+    _write_overview(settings, result, planned)
     return result
+
+
+@contextmanager
+def _log_file(folder: Path) -> Iterator[None]:
+    """Everything that is logged goes to batch.log too, behind what earlier runs wrote; where it can be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handler = logging.FileHandler(folder / "batch.log", encoding="utf-8")
+    except OSError:
+        yield  # the scenes will say that the folder cannot be written
+        return
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    level = log.level
+    log.setLevel(logging.INFO)
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+        handler.close()
 
 
 def _outcomes(planned: Sequence[Scene], overwrite: bool, progress: SceneProgress) -> Iterator[SceneOutcome]:
@@ -124,47 +148,84 @@ def _outcomes(planned: Sequence[Scene], overwrite: bool, progress: SceneProgress
         try:
             if not overwrite and publish.is_current(target, resume_key(scene)):
                 report = json.loads((target / "report.json").read_text(encoding="utf-8"))
+                log.info("scene '%s' is current", scene.name)
                 yield SceneOutcome(scene.name, "current", target, report=report)
                 continue
+            started = time.perf_counter()
             report = correct_scene(scene, progress(scene))
+            log.info("scene '%s' done in %.1f s", scene.name, time.perf_counter() - started)
             yield SceneOutcome(scene.name, "done", target, report=report)
-        except (TscorrError, OSError, MemoryError) as error:
+        except Exception as error:  # one scene must not stop the batch
+            expected = isinstance(error, TscorrError | OSError | MemoryError)
             message = str(error) or type(error).__name__
-            log.error("scene '%s' failed: %s", scene.name, message)  # noqa: TRY400 - the message is for the user
+            message = (
+                message if expected else f"{type(error).__name__}: {message} (a fault of tscorr; please report it)"
+            )
+            log.error("scene '%s' failed: %s", scene.name, message, exc_info=None if expected else error)  # noqa: TRY400
             yield SceneOutcome(scene.name, "failed", target, error=message)
 
 
-def _write_overview(settings: config.Config, result: BatchResult) -> None:
-    """batch.json and index.html at the top of the output folder."""
+def _write_overview(settings: config.Config, result: BatchResult, planned: Sequence[Scene]) -> None:
+    """batch.json, index.html and the STAC collection at the top of the output folder."""
     rows = [
         {"scene": scene.name, "state": scene.state, "folder": scene.folder.name, "error": scene.error}
         for scene in result.scenes
     ]
-    batch = {"title": settings.title, "tscorr": __version__, "scenes": rows}
+    shared = _overlaps(result, planned)
+    batch = {
+        "title": settings.title,
+        "tscorr": __version__,
+        "scenes": rows,
+        "overlaps": [asdict(overlap) for overlap in shared],
+    }
+    page = batch_page(settings.title, _lines(settings, result), shared, __version__)
     try:
         result.folder.mkdir(parents=True, exist_ok=True)
         (result.folder / "batch.json").write_text(json.dumps(batch, indent=1) + "\n", encoding="utf-8")
-        (result.folder / "index.html").write_text(_index(settings.title, result), encoding="utf-8")
+        (result.folder / "index.html").write_text(page, encoding="utf-8")
+        items = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(result.folder.glob("*/item.json"))]
+        if items:
+            collected = stac.collection(title=settings.title or "tscorr", items=items)
+            (result.folder / "collection.json").write_text(json.dumps(collected, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         log.warning("the overview in %s could not be written: %s", result.folder, error)
 
 
-def _index(title: str, result: BatchResult) -> str:
-    rows = []
-    for scene in result.scenes:
-        name, folder = html.escape(scene.name), html.escape(scene.folder.name, quote=True)
-        pixels = scene.report["pixels"]["corrected"] if scene.report else 0
-        link = f'<a href="{folder}/report.html">{name}</a>' if scene.state != "failed" else name
-        rows.append(
-            f"<tr><td>{link}</td><td>{scene.state}</td><td>{pixels:,}</td><td>{html.escape(scene.error)}</td></tr>"
-        )
-    heading = html.escape(title or "tscorr")
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{heading}</title>'
-        "<style>body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}"
-        "table{border-collapse:collapse;width:100%}td,th{text-align:left;padding:.4rem .6rem;"
-        "border-bottom:1px solid #ccc}</style>"
-        f"<h1>{heading}</h1><table><tr><th>scene</th><th>state</th><th>pixels corrected</th><th>error</th></tr>"
-        + "".join(rows)
-        + "</table></html>\n"
-    )
+def _lines(settings: config.Config, result: BatchResult) -> list[SceneLine]:
+    """The scenes of this run, and those of the configuration that earlier runs have published."""
+    lines = [
+        SceneLine(scene.name, scene.state, scene.folder.name, scene.error, scene.report) for scene in result.scenes
+    ]
+    known = {scene.name for scene in result.scenes}
+    for name in (str(scene.name) for scene in settings.scenes):
+        report = result.folder / name / "report.json"
+        if name not in known and report.exists():
+            lines.append(SceneLine(name, "earlier", name, report=json.loads(report.read_text(encoding="utf-8"))))
+    return lines
+
+
+def _overlaps(result: BatchResult, planned: Sequence[Scene]) -> list[Overlap]:
+    """The differences of scenes that share ground; those of the last run where it had the same results."""
+    states = {scene.name: scene.state for scene in result.scenes}
+    if set(states.values()) == {"current"} and (known := _known_overlaps(result)) is not None:
+        return known
+    try:
+        return overlaps([(scene, target_of(scene)) for scene in planned if states[scene.name] != "failed"])
+    except (TscorrError, OSError) as error:
+        log.warning("the overlaps of the scenes could not be compared: %s", error)
+        return []
+
+
+def _known_overlaps(result: BatchResult) -> list[Overlap] | None:
+    """The overlaps in batch.json if it is of the same scenes, none of which failed."""
+    try:
+        batch = json.loads((result.folder / "batch.json").read_text(encoding="utf-8"))
+        same = [row["scene"] for row in batch["scenes"]] == [scene.name for scene in result.scenes]
+        if not same or any(row["state"] == "failed" for row in batch["scenes"]):
+            return None
+        return [
+            Overlap(row["first"], row["second"], {name: Difference(*d) for name, d in row["materials"].items()})
+            for row in batch["overlaps"]
+        ]
+    except (OSError, ValueError, KeyError, TypeError):  # missing, or of another version
+        return None

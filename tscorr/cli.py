@@ -10,12 +10,12 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from tscorr import __version__
-from tscorr.errors import TscorrError
+from tscorr.errors import ConfigError, TscorrError
 
 if TYPE_CHECKING:
     from tscorr.batch import BatchResult, SceneProgress
@@ -28,7 +28,9 @@ def with_clear_errors(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
-        logging.basicConfig(format="tscorr: %(message)s", level=logging.WARNING, stream=sys.stderr)
+        console = logging.StreamHandler(sys.stderr)
+        console.setLevel(logging.WARNING)
+        logging.basicConfig(format="tscorr: %(message)s", handlers=[console])
         try:
             return command(*args, **kwargs)
         except TscorrError as error:
@@ -129,12 +131,12 @@ def percent(share: float | None) -> str:
     return f"{100 * share:.1f} %"
 
 
-def print_table(rows: Sequence[Sequence[str]]) -> None:
-    """Columns side by side, the first two to the left, numbers to the right."""
+def print_table(rows: Sequence[Sequence[str]], left: int = 2) -> None:
+    """Columns side by side, the first `left` to the left, numbers to the right."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for row in rows:
         cells = [
-            cell.ljust(width) if i < 2 else cell.rjust(width)
+            cell.ljust(width) if i < left else cell.rjust(width)
             for i, (cell, width) in enumerate(zip(row, widths, strict=True))
         ]
         click.echo("  ".join(cells).rstrip())
@@ -206,6 +208,133 @@ def materials(library: Sequence[Path]) -> None:
         rows.append((name, entry.source[:48], bands, *values))
     print_table(rows)
     click.echo("t0, t1 in 1/sr, w in 1/degree, at the first wavelength")
+
+
+form_option = click.option(
+    "--form", type=click.Choice(["full", "simplified"]), default="full", help="simplified: without the factor G."
+)
+library_option = click.option(
+    "--library",
+    "libraries",
+    multiple=True,
+    metavar="FILE",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Another material file.",
+)
+
+
+@cli.command()
+@click.argument("files", nargs=-1, type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option(
+    "--scenes",
+    "config",
+    metavar="CONFIG",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Fit to the images of a configuration instead, seen in different directions.",
+)
+@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Material file to write.")
+@click.option("--name", help="Name of the material; several files are then of this one surface.")
+@click.option("--k", default="0.25", show_default=True, help="Held at this value, or 'free'.")
+@click.option("--wavelengths", metavar="UM,UM...", help="Only these, in um.")
+@form_option
+@click.option("--bootstrap", type=click.IntRange(0), default=0, metavar="N", help="Replicates that check the errors.")
+@click.option("--plot", type=click.Path(file_okay=False, path_type=Path), help="Folder for plots of the fit.")
+@with_clear_errors
+def fit(
+    files: Sequence[Path],
+    config: Path | None,
+    output: Path | None,
+    name: str | None,
+    k: str,
+    wavelengths: str | None,
+    form: Literal["full", "simplified"],
+    bootstrap: int,
+    plot: Path | None,
+) -> None:
+    """Fit materials to goniometer FILES (.csv, .brdf), or to the scenes of a configuration."""
+    if (config is None) == (not files):
+        raise ConfigError("give files of measurements, or --scenes CONFIG" + (", not both" if files else ""))
+    held = None if k == "free" else _number("--k", k, "a number or 'free'")
+    if config is None:
+        from tscorr.fit import FitSettings, fit_files
+
+        settings = FitSettings(k=held, form=form, bootstrap=bootstrap)
+        only = (
+            None if wavelengths is None else [_number("--wavelengths", um, "um,um") for um in wavelengths.split(",")]
+        )
+        fitted = fit_files(files, output, name=name, wavelengths_um=only, settings=settings, plot_directory=plot)
+        click.echo(fitted.text)
+    else:
+        given = {"--name": name, "--wavelengths": wavelengths, "--bootstrap": bootstrap, "--plot": plot}
+        for option in (option for option, value in given.items() if value):
+            raise ConfigError(f"{option} is for files of measurements; leave it out with --scenes")
+        click.echo(_fit_to_scenes(config, output, held, form))
+    if output is not None:
+        click.echo(f"materials: {output}")
+
+
+def _fit_to_scenes(config: Path, output: Path | None, k: float | None, form: Literal["full", "simplified"]) -> str:
+    """Fit the materials of a configuration to its scenes; the result as text."""
+    from tscorr import batch
+    from tscorr.config import load_config
+    from tscorr.fit.scenes import SceneFitSettings
+    from tscorr.scene.samples import fit_scenes
+
+    if k is None:
+        raise ConfigError("--k free is for files of measurements: images do not tell n, t1 and k apart")
+    with progress_bars(enabled=sys.stderr.isatty()) as progress:
+        return fit_scenes(batch.plan(load_config(config)), output, SceneFitSettings(k=k, form=form), progress).text
+
+
+def _number(option: str, text: str, allowed: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigError(f"{option} = {text!r}; allowed is {allowed}") from None
+
+
+@cli.command()
+@click.argument("names", nargs=-1, required=True, metavar="MATERIAL...")
+@library_option
+@form_option
+@click.option("--wavelength", type=float, metavar="UM", help="Default: the middle one of each material.")
+@click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Picture to write: .png, .svg or .pdf.")
+@with_clear_errors
+def width(
+    names: Sequence[str], libraries: Sequence[Path], form: str, wavelength: float | None, plot: Path | None
+) -> None:
+    """Show how wide the specular peak of each MATERIAL is, against the angle of incidence."""
+    from tscorr.materials import builtin_materials, find, load_materials
+    from tscorr.width import crossover_incidence, width_rows
+
+    known = dict(builtin_materials())
+    for path in libraries:
+        known.update(load_materials(path))
+    surfaces = [find(name, known) for name in names]
+    rows: list[tuple[str, ...]] = [("material", "incidence", "azimuthal", "arc", "zenithal", "peak exitance")]
+    notes = []
+    for surface in surfaces:
+        if not surface.has_peak:
+            notes.append(f"{surface.name} has no peak")
+            continue
+        for row in width_rows(surface, form=form, wavelength_um=wavelength):
+            incidence, *widths = row.values()
+            rows.append((surface.name, f"{incidence:.0f}", *("-" if v is None else f"{v:.1f}" for v in widths)))
+        crossover = crossover_incidence(surface, form, wavelength_um=wavelength)
+        notes.append(
+            f"{surface.name}: from {crossover:.1f} degrees of incidence on, its exponential is narrower in azimuth "
+            f"than in the principal plane"
+        )
+    print_table(rows, left=1)
+    click.echo("degrees; azimuthal width and arc: full width at half maximum of the lobe at exitance = incidence;")
+    click.echo("zenithal width: of the exponential, cut at the horizon; -: no half maximum, or no peak before it")
+    for note in notes:
+        click.echo(note)
+    if plot is not None:
+        from tscorr.width.plot import save_width_plot
+
+        save_width_plot(surfaces, plot, form)
+        click.echo(f"plot: {plot}")
 
 
 @cli.command()

@@ -94,7 +94,8 @@ def read_manifest(target: Path) -> dict[str, Any] | None:
         manifest = json.loads((target / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return manifest if isinstance(manifest, dict) else None
+    whole = isinstance(manifest, dict) and isinstance(manifest.get("outputs"), dict)
+    return manifest if whole else None
 
 
 def damaged(target: Path) -> list[str]:

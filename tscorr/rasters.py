@@ -14,8 +14,9 @@ from typing import Any, Self
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.enums import Interleaving, Resampling
+from rasterio.enums import ColorInterp, Interleaving, Resampling
 from rasterio.errors import RasterioError
+from rasterio.shutil import copy as copy_raster
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import transform_bounds
 
@@ -29,6 +30,7 @@ DRIVERS = ["GTiff", "ENVI", "HFA", "JP2OpenJPEG", "PNG", "JPEG", "AAIGrid", "EHd
 LARGEST_TILE_BYTES = 256e6
 MISALIGNED_PIXELS = 0.01
 """pixels of two grids that are off by less than this coincide"""
+COG_TILE = 512
 IMAGE_TYPES = ("uint8", "int16", "uint16", "float32")
 ENVIRONMENT = {"GDAL_CACHEMAX": 64, "GDAL_NUM_THREADS": "1"}
 
@@ -54,6 +56,7 @@ class RasterInfo:
     tags: dict[str, str]
     band_tags: tuple[dict[str, dict[str, str]], ...]
     """for each band, tags by domain ('' and 'IMAGERY')"""
+    colors: tuple[ColorInterp, ...]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -101,7 +104,7 @@ def describe(path: str | Path) -> RasterInfo:
             grid=Grid(dataset.crs, dataset.transform, dataset.shape),
             bands=dataset.count,
             dtype=dtype,
-            nodata=dataset.nodata,
+            nodata=dataset.nodata if can_hold(dtype, dataset.nodata) else None,
             scales=tuple(dataset.scales),
             offsets=tuple(dataset.offsets),
             names=tuple(name or f"band {i + 1}" for i, name in enumerate(dataset.descriptions)),
@@ -111,7 +114,17 @@ def describe(path: str | Path) -> RasterInfo:
             profile=_profile(dataset),
             tags=dataset.tags(),
             band_tags=tuple({ns: dataset.tags(i, ns=ns) for ns in ("", "IMAGERY")} for i in dataset.indexes),
+            colors=tuple(dataset.colorinterp),
         )
+
+
+def can_hold(dtype: np.dtype[Any], value: float | None) -> bool:
+    """Whether a pixel of this type can have the value."""
+    if value is None:
+        return False
+    if dtype.kind in "iu":
+        return float(value).is_integer() and np.iinfo(dtype).min <= value <= np.iinfo(dtype).max
+    return not np.isfinite(value) or abs(value) <= float(np.finfo(dtype).max)
 
 
 def _profile(dataset: Any) -> dict[str, Any]:
@@ -169,7 +182,14 @@ def check_overlap(raster: RasterInfo, image: RasterInfo, what: str) -> None:
         raise InputError(f"the image {image.path} has no CRS; {what} {raster.path} cannot be laid over it")
     if raster.grid.crs is None:
         raise InputError(f"{what} {raster.path} has no CRS; it must say where it is")
-    west, south, east, north = transform_bounds(raster.grid.crs, image.grid.crs, *_bounds(raster.grid))
+    try:
+        with rasterio.Env():
+            west, south, east, north = transform_bounds(raster.grid.crs, image.grid.crs, *_bounds(raster.grid))
+    except Exception as error:  # noqa: BLE001 - rasterio raises PROJ's errors unwrapped
+        raise InputError(
+            f"{what} {raster.path} is in a CRS that cannot be turned into that of the image {image.path}: "
+            f"{str(error).splitlines()[0][:200]}"
+        ) from None
     left, bottom, right, top = _bounds(image.grid)
     if not (west < right and east > left and south < top and north > bottom):
         raise InputError(
@@ -271,6 +291,10 @@ class Reader:
         rows, cols = self._grid.shape
         grid = self._grid.crop(Block(0, 0, rows, cols).padded(self._margin))
         nodata = self.info.nodata if self.info.nodata is not None else self._fill
+        # Where its cells are slightly smaller than those of the grid, GDAL widens its bilinear kernel by as
+        # little, and unevenly: heights then err by a tenth of a cell times the slope.
+        similar = min(self.info.grid.cell_size) > 0.5 * max(grid.cell_size)
+        exactly_bilinear = {"XSCALE": 1, "YSCALE": 1} if similar else {}
         return WarpedVRT(
             source,
             crs=grid.crs,
@@ -280,6 +304,7 @@ class Reader:
             resampling=self._resampling,
             nodata=nodata,
             warp_mem_limit=64,
+            **exactly_bilinear,
         )
 
     def close(self) -> None:
@@ -356,6 +381,8 @@ class Writer:
                         dataset.update_tags(index, ns=domain, **tags)
                     else:
                         dataset.update_tags(index, **tags)
+        if layer.of_image and ColorInterp.palette not in like.colors:
+            dataset.colorinterp = like.colors  # else GDAL takes the fourth of four bytes for transparency
         if layer.scales is not None:
             dataset.scales, dataset.offsets = layer.scales, layer.offsets
         if layer.units is not None:
@@ -417,10 +444,28 @@ def _fitting_predictor(options: dict[str, Any], dtype: np.dtype[Any]) -> dict[st
     return options
 
 
-def read_decimated(info: RasterInfo, max_size: int, bands: Sequence[int] | None = None) -> Array:
-    """Stored values of a raster (bands, rows, cols), float32, no side longer than `max_size`; nan where nodata.
+def make_cog(path: Path, resampling: Resampling) -> None:
+    """Turn a GeoTIFF into a cloud-optimised one, with overviews of half, a quarter, ... down to one tile."""
+    hidden = path.with_name(f".{path.name}.cog")
+    try:
+        with rasterio.Env(**ENVIRONMENT):
+            with rasterio.open(path, "r+") as dataset:
+                profile, longest = dataset.profile, max(dataset.shape)
+                levels = [2**i for i in range(1, 16) if longest // 2 ** (i - 1) > COG_TILE]
+                dataset.build_overviews(levels, resampling)
+            options = {"blocksize": COG_TILE, "overviews": "FORCE_USE_EXISTING" if levels else "NONE"}
+            options["compress"] = profile.get("compress", "none")
+            options["predictor"] = "YES" if options["compress"] in {"deflate", "lzw", "zstd"} else "NO"
+            copy_raster(path, hidden, driver="COG", **options)
+        hidden.replace(path)
+    except RasterioError as error:
+        raise OutputError(f"{path} cannot be made a cloud-optimised GeoTIFF: {error}") from None
 
-    Averages; overviews are used where the file has them.
+
+def read_decimated(info: RasterInfo, max_size: int, bands: Sequence[int] | None = None) -> Array:
+    """Stored values of a raster (bands, rows, cols), float32, no side longer than `max_size`.
+
+    Averages; nan where nodata or an infinite value is among them; overviews are used where the file has them.
     """
     rows, cols = info.shape
     step = max(1.0, max(rows, cols) / max_size)
@@ -428,7 +473,9 @@ def read_decimated(info: RasterInfo, max_size: int, bands: Sequence[int] | None 
     indexes = list(bands or range(1, info.bands + 1))
     with opened(info.path) as dataset:
         values = dataset.read(indexes, out_shape=(len(indexes), *shape), resampling=Resampling.average, masked=True)
-    return np.ma.filled(values.astype(np.float32), np.nan)
+    filled = np.ma.filled(values.astype(np.float32), np.nan)
+    filled[~np.isfinite(filled)] = np.nan
+    return filled
 
 
 def read_decimated_flags(info: RasterInfo, max_size: int) -> Array:

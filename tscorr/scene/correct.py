@@ -4,6 +4,7 @@ import resource
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ Array = NDArray[Any]
 
 VIEW_SAMPLES = 48
 """the report samples the view directions on a grid of at most this many points a side"""
+RASTER_SAMPLES = 20
 PICTURE_PX = 768
 
 
@@ -52,7 +54,7 @@ def target_of(scene: Scene) -> Path:
 def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
     """Correct a scene and publish its folder; the content of its report.json."""
     started = time.perf_counter()
-    with publish.Publication(target_of(scene)) as publication:
+    with closing(scene), publish.Publication(target_of(scene)) as publication:
         pipeline = Pipeline(scene, publication.folder)
         pipeline.run(progress)
         facts = facts_of(scene, pipeline, time.perf_counter() - started)
@@ -83,6 +85,7 @@ def facts_of(scene: Scene, pipeline: Pipeline, wall_s: float) -> SceneFacts:
     zenith, azimuth = _view_samples(scene)
     sun, sums = scene.sun, pipeline.sums
     middle = zenith.shape[0] // 2, zenith.shape[1] // 2
+    centre = float(zenith[middle]), float(azimuth[middle])
     return SceneFacts(
         scene=scene.name,
         image=scene.image.path.name,
@@ -101,7 +104,7 @@ def facts_of(scene: Scene, pipeline: Pipeline, wall_s: float) -> SceneFacts:
         view_zenith_deg=zenith,
         view_azimuth_deg=azimuth,
         relative_azimuth_deg=relative_azimuth(azimuth, sun.azimuth_deg),
-        centre_view_deg=(float(zenith[middle]), float(azimuth[middle])),
+        centre_view_deg=centre if np.isfinite(centre).all() else None,
         seconds={"wall": wall_s, **sums.seconds},
         peak_rss_mb=peak_rss_mb(),
         version=__version__,
@@ -109,21 +112,38 @@ def facts_of(scene: Scene, pipeline: Pipeline, wall_s: float) -> SceneFacts:
 
 
 def _view_samples(scene: Scene) -> tuple[Array, Array]:
-    """View zenith angle and azimuth from true north on a coarse grid over the scene. [deg]"""
+    """View zenith angle and azimuth from true north on a coarse grid over the scene; nan where unseen. [deg]"""
     rows, cols = scene.image.shape
+    if scene.seen.layers:
+        return _view_pixels(scene)
     count_rows, count_cols = min(rows, VIEW_SAMPLES), min(cols, VIEW_SAMPLES)
     step = scene.grid.transform.scale(cols / count_cols, rows / count_rows)
     coarse = Grid(scene.grid.crs, scene.grid.transform @ step, (count_rows, count_cols))
     block = Block(0, 0, count_rows, count_cols)
-    vectors = scene.view.vectors(coarse, block, np.full((1, 1), scene.ground_level_m))
-    vectors = np.broadcast_to(vectors, (3, count_rows, count_cols))
+    look = scene.view.look(coarse, block, np.full((1, 1), scene.ground_level_m))
+    vectors = np.broadcast_to(look.vectors, (3, count_rows, count_cols))
+    if look.unseen is not None:
+        vectors = np.where(look.unseen, np.nan, vectors)
+    zenith, azimuth = zenith_azimuth(vectors)
+    return zenith, true_azimuth(azimuth, scene.sun.convergence_deg)
+
+
+def _view_pixels(scene: Scene) -> tuple[Array, Array]:
+    """The same where directions are read from rasters: of single pixels, since each costs a tile to be read."""
+    rows, cols = (np.unique(np.linspace(0, size - 1, RASTER_SAMPLES).astype(int)) for size in scene.image.shape)
+    vectors = np.full((3, rows.size, cols.size), np.nan)
+    heights = np.full((1, 1), scene.ground_level_m)
+    for i, j in np.ndindex(rows.size, cols.size):
+        look = scene.view.look(scene.grid, Block(int(rows[i]), int(cols[j]), 1, 1), heights)
+        if look.unseen is None:
+            vectors[:, i, j] = look.vectors[:, 0, 0]
     zenith, azimuth = zenith_azimuth(vectors)
     return zenith, true_azimuth(azimuth, scene.sun.convergence_deg)
 
 
 def _sun_later(scene: Scene) -> Any:
     """Function of minutes to solar zenith angle and azimuth, where the time is known."""
-    start = scene.settings.sun.time if scene.settings.sun is not None else None
+    start = scene.sun.time
     if start is None:
         return None
     longitude, latitude = map(float, longitude_latitude(scene.grid, *scene.grid.center))
@@ -160,11 +180,10 @@ def _bands(scene: Scene, info: rasters.RasterInfo, bands: Iterable[int]) -> Iter
 def stac_item(scene: Scene, folder: Path, facts: SceneFacts, report: Mapping[str, Any]) -> dict[str, Any]:
     """The STAC item of a scene that is being published."""
     zenith, azimuth = facts.centre_view_deg or (float("nan"), float("nan"))
-    sun = scene.settings.sun
     return stac.item(
         name=scene.name,
         grid=scene.grid,
-        datetime=None if sun is None else sun.time,
+        datetime=scene.sun.time,
         files={path.stem: rasters.describe(path) for path in sorted(folder.glob("*.tif"))},
         inputs=scene.inputs,
         solar_zenith_deg=facts.solar_zenith_deg,

@@ -1,17 +1,17 @@
 """Everything that is known of one pixel: the content of `tscorr explain`."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from tscorr import rasters, reference
+from tscorr import reference
 from tscorr.angles import facet_angles, true_azimuth, zenith_azimuth
 from tscorr.correction import SINGLE_FLAGS, SpecularState, class_rows, specular_state
 from tscorr.errors import InputError
-from tscorr.grid import Block
-from tscorr.scene.ground import Ground
+from tscorr.grid import Block, north_of
 from tscorr.scene.plan import Scene
 from tscorr.scene.run import Pipeline
 
@@ -24,22 +24,19 @@ def explanation(scene: Scene, row: int, col: int) -> dict[str, dict[str, Any]]:
     block = Block(row, col, 1, 1)
     with TemporaryDirectory() as folder:
         pipeline = Pipeline(scene, Path(folder))
-        with (
-            rasters.Reader(scene.image) as image,
-            rasters.Reader(scene.class_map, scene.grid) as classes,
-            Ground(scene) as ground,
-        ):
-            class_value = classes.read(block, 1)
+        with ExitStack() as files:
+            pipeline.open(files)
+            class_value = pipeline.classes.read(block, 1)
             material_rows = class_rows(class_value, scene.rows)
-            stored = image.read(block)
-            ground.prepare()
-            pipeline.ground = ground
-            inputs = pipeline.inputs(block, stored.copy(), material_rows, np.ones((1, 1), np.bool_))
-            height = float(ground.surface.heights(block)[0, 0])
+            stored = pipeline.image.read(block)
+            pipeline.ground.prepare()
+            inputs, _ = pipeline.inputs(block, stored.copy(), material_rows, np.ones((1, 1), np.bool_))
+            heights = pipeline.ground.surface.heights(block)
         result = pipeline.corrector(inputs, first_row=row)
     lines = {
-        "pixel": _pixel(scene, row, col, int(class_value[0, 0]), height),
-        "directions (zenith, azimuth from true north)": _directions(scene, inputs),
+        "pixel": _pixel(scene, row, col, int(class_value[0, 0]), float(heights[0, 0]))
+        | scene.view.describe(scene.grid, block, heights),
+        "directions (zenith, azimuth from true north)": _directions(scene, block, inputs),
     }
     place = int(material_rows[0, 0])
     if place:
@@ -79,8 +76,8 @@ def _pixel(scene: Scene, row: int, col: int, class_value: int, height: float) ->
     }
 
 
-def _directions(scene: Scene, inputs: Any) -> dict[str, Any]:
-    convergence = scene.sun.convergence_deg
+def _directions(scene: Scene, block: Block, inputs: Any) -> dict[str, Any]:
+    convergence = float(north_of(scene.grid).convergence_deg(block)[0, 0])
     lines = {"meridian convergence": f"{convergence:.4f} degrees"}
     for name in ("sun", "view", "normal"):
         vector = np.asarray(getattr(inputs, name), dtype=float).reshape(3)

@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from tscorr import publish, rasters
+from tscorr import publish
 from tscorr.angles import zenith_azimuth
 from tscorr.correction import Corrector, class_rows
 from tscorr.grid import Block
 from tscorr.scene.correct import resume_key, target_of
 from tscorr.scene.plan import Scene
-from tscorr.scene.run import units, workers_of
+from tscorr.scene.run import units_of, workers_of
 
 PRODUCT_BYTES = {"flags": 2, "azimuthal_width": 4, "angles": 36}
 IMPORTS_MB = 220.0
@@ -20,9 +20,9 @@ def forecast(scene: Scene) -> dict[str, Any]:
     """Shares of the materials, blocks with nothing to correct, disk and memory; reads the class map only."""
     peaks = Corrector(scene.materials, scene.stored).peaks
     counts = np.zeros(len(scene.materials) + 1, np.int64)
-    cut = units(scene.image)
+    cut = units_of(scene)
     idle = 0
-    with rasters.Reader(scene.class_map, scene.grid) as classes:
+    with scene.classes() as classes:
         for block in cut:
             in_block = np.bincount(class_rows(classes.read(block, 1), scene.rows).ravel(), minlength=len(counts))
             counts += in_block

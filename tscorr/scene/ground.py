@@ -1,7 +1,8 @@
 """The ground of a scene: its surface, and what is in shadow or hidden, over the pixels of the image."""
 
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from tscorr import config, rasters
 from tscorr.correction.edges import dilated, rim
 from tscorr.errors import InputError
 from tscorr.grid import Block
+from tscorr.scene.directions import obs_normals
 from tscorr.scene.plan import Scene
 from tscorr.sensor import ConstantView, FrameView, LineView
 from tscorr.terrain import shadows
@@ -99,6 +101,9 @@ class Ground:
         if isinstance(settings, config.DsmSettings):
             return dsm
         info = self._scene.surface_files[-1]
+        if isinstance(settings, config.ObsSurfaceSettings):
+            slopes = self._files.enter_context(closing(obs_normals(info)))
+            return GivenNormals(partial(slopes, self._scene.grid), dsm)
         normals = self._files.enter_context(
             rasters.Reader(info, self._scene.grid, resampling=Resampling.nearest, fill=float("nan"))
         )

@@ -1,21 +1,21 @@
 """What is known of a scene before its pixels are read: every input opened, checked and understood."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.crs import CRS
 
 from tscorr import config, rasters
 from tscorr.correction import NEGLIGIBLE_REFLECTANCE, Rules, Stored
 from tscorr.errors import ConfigError, InputError, MaterialError
-from tscorr.grid import Grid, reproject
+from tscorr.grid import Grid
 from tscorr.materials import BandParameters, Material, find
-from tscorr.sensor import ConstantView, FrameView, LineView, View, read_trajectory
-from tscorr.sun import SunField, given_sun, sun_at
+from tscorr.scene.directions import Seen, close_all, obs_file, sun_of, view_of
+from tscorr.sensor import View
+from tscorr.sun import Sun
 
 Array = NDArray[Any]
 
@@ -32,12 +32,15 @@ class Scene:
     config: config.Config
     image: rasters.RasterInfo
     class_map: rasters.RasterInfo
+    confidence: rasters.RasterInfo | None
+    """how sure the class of each pixel is"""
     materials: tuple[tuple[Material, BandParameters, Rules], ...]
     rows: dict[int, int]
     """row of the corrector for each class of the class map"""
     stored: Stored
-    sun: SunField
-    view: View
+    sun: Sun
+    seen: Seen
+    """the view, and the files that it is read from"""
     surface_files: tuple[rasters.RasterInfo, ...]
     wavelengths_um: tuple[float, ...] | None
     ground_level_m: float
@@ -49,17 +52,34 @@ class Scene:
         return self.image.grid
 
     @property
+    def view(self) -> View:
+        """How the scene was seen."""
+        return self.seen.view
+
+    def close(self) -> None:
+        """Close the files of the view; they are opened again when they are needed."""
+        close_all(self.seen.layers)
+
+    @property
     def inputs(self) -> list[Path]:
         """Every file that the result depends on."""
         files = [self.image.path, self.class_map.path, *(info.path for info in self.surface_files)]
-        if isinstance(self.settings.view, config.LineViewSettings):
-            files.append(Path(self.settings.view.trajectory))
-        return [*files, *map(Path, self.config.materials.library)]
+        if self.confidence is not None:
+            files.append(self.confidence.path)
+        if self.settings.truth is not None:
+            files += [Path(self.settings.truth.diffuse), Path(self.settings.truth.sunlit)]
+        return [*files, *self.seen.files, *map(Path, self.config.materials.library)]
 
     @property
     def heights_file(self) -> rasters.RasterInfo | None:
         """The raster of heights, if the surface has one."""
         return next((info for info in self.surface_files if info.bands == 1), None)
+
+    def classes(self) -> rasters.Reader:
+        """The class map on the image's grid; a value that no material has where it does not reach."""
+        limits = np.iinfo(self.class_map.dtype)
+        unused = next(value for value in range(limits.max, limits.min - 1, -1) if value not in self.rows)
+        return rasters.Reader(self.class_map, self.grid, fill=unused)
 
     @property
     def tally_stride(self) -> int:
@@ -81,7 +101,11 @@ def plan_scene(
     if image.dtype.name not in rasters.IMAGE_TYPES:
         allowed = ", ".join(rasters.IMAGE_TYPES)
         raise InputError(f"the image {image.path} holds {image.dtype} values; allowed are {allowed}")
-    class_map = _class_map(settings, image)
+    class_map = _class_map(settings, whole, image)
+    confidence = None
+    if settings.class_confidence is not None:
+        confidence = _single_band(settings.class_confidence, image, "the class confidence")
+    _check_truth(settings.truth, image)
     stored = _stored(settings, image)
     names = list(dict.fromkeys(whole.materials.classes.values()))
     wavelengths = _wavelengths(settings, image)
@@ -93,35 +117,59 @@ def plan_scene(
         )
         for name in names
     )
-    sun = _sun(settings, image)
-    view = _view(settings.view, image.grid)
+    seen = view_of(settings.view, image)
     surface_files = tuple(_surface_files(settings.surface, image))
     ground_level, highest = _heights(settings.surface, surface_files)
-    view.check(image.grid, highest)
+    seen.view.check(image.grid, highest)
+    sun = sun_of(settings.sun, seen, image, ground_level)
     return Scene(
         name=settings.name or image.path.stem,
         settings=settings,
         config=whole,
         image=image,
         class_map=class_map,
+        confidence=confidence,
         materials=materials,
         rows={value: names.index(name) + 1 for value, name in whole.materials.classes.items()},
         stored=stored,
         sun=sun,
-        view=view,
+        seen=seen,
         surface_files=surface_files,
         wavelengths_um=wavelengths,
         ground_level_m=ground_level,
     )
 
 
-def _class_map(settings: config.Scene, image: rasters.RasterInfo) -> rasters.RasterInfo:
-    class_map = rasters.describe(settings.class_map)
+def _class_map(settings: config.Scene, whole: config.Config, image: rasters.RasterInfo) -> rasters.RasterInfo:
+    class_map = _single_band(settings.class_map, image, "the class map")
     if class_map.dtype.kind not in "iu":
         raise InputError(f"the class map {class_map.path} holds {class_map.dtype} values; allowed are integers")
-    if class_map.grid != image.grid:
-        rasters.check_overlap(class_map, image, "the class map")
+    if class_map.nodata in whole.materials.classes:
+        raise InputError(
+            f"the class map {class_map.path} has the nodata value {class_map.nodata:g}, which is also a class of "
+            f"[materials.classes]; allowed is one of the two"
+        )
     return class_map
+
+
+def _single_band(path: str, image: rasters.RasterInfo, what: str) -> rasters.RasterInfo:
+    """A raster of one band that shares ground with the image."""
+    raster = rasters.describe(path)
+    if raster.bands != 1:
+        raise InputError(f"{what} {raster.path} has {raster.bands} bands; allowed is one")
+    if raster.grid != image.grid:
+        rasters.check_overlap(raster, image, what)
+    return raster
+
+
+def _check_truth(truth: config.Truth | None, image: rasters.RasterInfo) -> None:
+    """The rasters of the truth must have the pixels of the image."""
+    if truth is None:
+        return
+    for path in (truth.diffuse, truth.sunlit):
+        info = rasters.describe(path)
+        if info.shape != image.shape:
+            raise InputError(f"the truth {info.path} has the shape {info.shape}; the image has {image.shape}")
 
 
 def _at_bands(surface: Material, wavelengths: tuple[float, ...] | None, image: rasters.RasterInfo) -> BandParameters:
@@ -156,6 +204,8 @@ def _stored(settings: config.Scene, image: rasters.RasterInfo) -> Stored:
     if any(value == 0 for value in scale):
         raise InputError(f"the image {image.path} has the scale 0; allowed is any other: give scale = ...")
     to_factor = np.pi if settings.quantity == "brdf" else 1.0
+    if settings.nodata is not None and not rasters.can_hold(image.dtype, settings.nodata):
+        raise ConfigError(f"nodata = {settings.nodata:g}, which no {image.dtype} pixel of {image.path} can be")
     saturation = settings.saturation
     return Stored(
         dtype=image.dtype,
@@ -205,39 +255,6 @@ def rules_of(
     )
 
 
-def _sun(settings: config.Scene, image: rasters.RasterInfo) -> SunField:
-    sun = settings.sun
-    if sun is None:
-        raise ConfigError(f"the image {image.path} has no sun: give sun = {{ time = ... }} or its angles")
-    if sun.time is not None:
-        return sun_at(image.grid, sun.time)
-    assert sun.zenith_deg is not None
-    assert sun.azimuth_deg is not None
-    return given_sun(image.grid, sun.zenith_deg, sun.azimuth_deg)
-
-
-def _view(settings: Any, grid: Grid) -> View:
-    if isinstance(settings, config.ConstantViewSettings):
-        return ConstantView(settings.zenith_deg, settings.azimuth_deg)
-    if isinstance(settings, config.FrameViewSettings):
-        x, y, z = settings.position
-        if settings.crs is not None:
-            x, y = map(float, _to_grid(settings.crs, grid)(x, y))
-        return FrameView((x, y, z + settings.height_offset_m))
-    to_grid = None if settings.crs is None else _to_grid(settings.crs, grid)
-    return LineView(read_trajectory(Path(settings.trajectory), grid, to_grid, settings.height_offset_m))
-
-
-def _to_grid(crs: str, grid: Grid) -> Callable[[Any, Any], tuple[Array, Array]]:
-    try:
-        source = CRS.from_user_input(crs)
-    except Exception as error:  # noqa: BLE001 - rasterio raises many kinds
-        raise ConfigError(f"crs = '{crs}' of a view is not known: {error}") from None
-    if grid.crs is None:
-        raise InputError(f"the image has no CRS; positions in {crs} cannot be laid over it")
-    return lambda x, y: reproject(source, grid.crs, x, y)
-
-
 def _surface_files(settings: Any, image: rasters.RasterInfo) -> Iterator[rasters.RasterInfo]:
     """The rasters of a surface, checked: heights first if there are any."""
     if isinstance(settings, config.FlatSettings):
@@ -253,6 +270,8 @@ def _surface_files(settings: Any, image: rasters.RasterInfo) -> Iterator[rasters
         if not image.grid.is_north_up:
             raise InputError(f"the image {image.path} is turned on its grid; with a surface model, north must be up")
         yield dsm
+    if isinstance(settings, config.ObsSurfaceSettings):
+        yield obs_file(settings.path, image, with_slope=True)
     if isinstance(settings, config.NormalsSettings):
         normals = rasters.describe(settings.path)
         if normals.bands != 3:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rasterio.enums import Resampling
 
 from tscorr import __version__, rasters
 from tscorr.angles import angle_between, facet_angles, true_azimuth, zenith_azimuth
@@ -25,7 +26,7 @@ from tscorr.correction import (
     new_tally,
 )
 from tscorr.correction.edges import ShadowByBrightness
-from tscorr.grid import Block, blocks
+from tscorr.grid import Block, blocks, north_of
 from tscorr.scene.ground import Ground
 from tscorr.scene.plan import Scene
 from tscorr.width import WidthTable, lobe_shapes
@@ -42,8 +43,12 @@ def silent(pixels: int) -> None:
 
 UNIT_COLUMNS = 2048
 STRIPE_COLUMNS = 8192
-UNIT_BYTES = 16e6
+BASE_MB = 300
+"""memory of the process before the first block, and of what does not grow with blocks"""
+COPIES = 5
+"""an image block and what is made of it, at most, in blocks of the image's own size"""
 MOST_WORKERS = 4
+LEAST_CONFIDENCE = 0.5
 ANGLE_NAMES = (
     "incidence",
     "exitance",
@@ -55,6 +60,9 @@ ANGLE_NAMES = (
     "view_zenith",
     "view_azimuth",
 )
+
+
+ANGLES_OF_SUN = {"incidence", "solar_zenith", "solar_azimuth"}
 
 
 class Sums:
@@ -95,16 +103,17 @@ class Sums:
                 self.seconds[part] += time.perf_counter() - start
 
 
-def units(image: rasters.RasterInfo) -> list[Block]:
+def units(image: rasters.RasterInfo, memory_limit_mb: int, workers: int) -> list[Block]:
     """Blocks that the work is cut into: whole tiles of the image, stripe by stripe.
 
-    Results do not depend on the cut; memory and speed do.
+    Results do not depend on the cut; memory and speed do. A block is never less than a tile, whatever the limit.
     """
     rows, cols = image.shape
     tile_rows, tile_cols = image.tile
     pixel_bytes = image.bands * image.dtype.itemsize
     width = cols if tile_cols >= cols else max(1, UNIT_COLUMNS // tile_cols) * tile_cols
-    room = int(UNIT_BYTES / pixel_bytes / min(width, cols))
+    unit_bytes = max(1e6, (memory_limit_mb - BASE_MB) * 1e6 / (workers * COPIES))
+    room = int(unit_bytes / pixel_bytes / min(width, cols))
     height = max(1, min(room, 512) // tile_rows) * tile_rows
     stripe = max(width, STRIPE_COLUMNS // width * width)
     return [
@@ -112,6 +121,11 @@ def units(image: rasters.RasterInfo) -> list[Block]:
         for first in range(0, cols, stripe)
         for block in blocks((rows, min(stripe, cols - first)), (height, width))
     ]
+
+
+def units_of(scene: Scene) -> list[Block]:
+    """The blocks of a scene under its configuration's memory limit."""
+    return units(scene.image, scene.config.run.memory_limit_mb, workers_of(scene))
 
 
 class Pipeline:
@@ -126,32 +140,43 @@ class Pipeline:
         self._by_brightness = ShadowByBrightness.of(scene.materials, scene.stored, scene.wavelengths_um)
         self.sums = Sums(len(scene.materials), scene.image.bands)
         self._products = set(scene.config.output.products)
+        self._north = north_of(scene.grid)
         self._tables = [
             WidthTable(shapes[len(shapes) // 2], rules.form) if peak else None
             for (_, parameters, rules), peak in zip(scene.materials, self.corrector.peaks[1:], strict=True)
             for shapes in [lobe_shapes(parameters)]
         ]
 
+    def open(self, files: ExitStack) -> None:
+        """Open the rasters of the scene; `files` closes them."""
+        scene = self.scene
+        self.image = files.enter_context(rasters.Reader(scene.image))
+        self.classes = files.enter_context(scene.classes())
+        self.ground = files.enter_context(Ground(scene))
+        self._confidence = None
+        if scene.confidence is not None:
+            self._confidence = files.enter_context(rasters.Reader(scene.confidence, scene.grid, fill=float("nan")))
+
     def run(self, progress: Progress) -> None:
         """All blocks, by the workers of the configuration; the first error stops the rest."""
         scene = self.scene
         with ExitStack() as files:
-            self.image = files.enter_context(rasters.Reader(scene.image))
-            self.classes = files.enter_context(rasters.Reader(scene.class_map, scene.grid))
-            self.ground = files.enter_context(Ground(scene))
+            self.open(files)
             if self.corrector.peaks.any():
                 with self.sums.timed("geometry"):
                     self.ground.prepare()
             self.writers = {name: self._writer(name) for name in sorted(self._products)}
             try:
-                run_all(self.block, units(scene.image), workers_of(scene), progress)
+                run_all(self.block, units_of(scene), workers_of(scene), progress)
             except BaseException:
                 for writer in self.writers.values():
                     writer.abandon()
                 raise
             with self.sums.timed("write"):
-                for writer in self.writers.values():
+                for name, writer in self.writers.items():
                     writer.close()
+                    if scene.config.output.format == "cog":
+                        rasters.make_cog(writer.path, Resampling.nearest if name == "flags" else Resampling.average)
 
     def block(self, block: Block) -> int:
         """Read, correct and write one block; the number of its pixels."""
@@ -161,8 +186,8 @@ class Pipeline:
         needed = self.corrector.peaks[rows]
         skipped = None if needed.any() else "blocks_no_specular_material"
         with self.sums.timed("geometry"):
-            inputs = self.inputs(block, image, rows, needed)
-        layers = self._angle_layers(block, inputs)
+            inputs, unseen = self.inputs(block, image, rows, needed)
+        layers = self._angle_layers(block, inputs, unseen)
         with self.sums.timed("kernel"):
             result = self.corrector(inputs, first_row=block.row, want_removed="removed" in self._products)
         layers |= {"corrected": result.corrected, "flags": result.flags[None]}
@@ -174,25 +199,40 @@ class Pipeline:
         self.sums.add(result, skipped)
         return rows.size
 
-    def inputs(self, block: Block, image: Array, rows: Array, needed: Array) -> BlockInputs:
-        """Directions and masks of a block; nothing of it is computed where no material has a peak."""
-        scene = self.scene
+    def inputs(self, block: Block, image: Array, rows: Array, needed: Array) -> tuple[BlockInputs, Array | None]:
+        """Directions and masks of a block; nothing of it is computed where no material has a peak.
+
+        And where no sensor is known to have looked: bool (rows, cols), or None where that is nowhere.
+        """
+        scene, doubtful = self.scene, self._doubtful(block)
         if not needed.any() and "angles" not in self._products:
             up = np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1)
-            return BlockInputs(image=image, material=rows, sun=up, view=up, normal=up)
-        sun = scene.sun.vectors(block)
+            inputs = BlockInputs(image=image, material=rows, sun=up, view=up, normal=up, low_confidence=doubtful)
+            return inputs, None
+        view, seconds, unseen = scene.view.look(scene.grid, block, self.ground.surface.heights(block))
+        sun = scene.sun.vectors(block, seconds)
         normal, unreliable = self.ground.surface.normals(block)
-        view = scene.view.vectors(scene.grid, block, self.ground.surface.heights(block))
-        return BlockInputs(
+        hidden = self.ground.hidden(block, needed) if needed.any() else None
+        inputs = BlockInputs(
             image=image,
             material=rows,
             sun=sun,
             view=view,
             normal=normal,
             shadowed=self._shadowed(block, image, rows, needed, sun, normal),
-            hidden=self.ground.hidden(block, needed) if needed.any() else None,
+            hidden=unseen if hidden is None else hidden if unseen is None else hidden | unseen,
             unreliable=unreliable,
+            low_confidence=doubtful,
         )
+        return inputs, unseen
+
+    def _doubtful(self, block: Block) -> Array | None:
+        """Where the class is not known to be more likely right than wrong, or None where nobody says."""
+        if self._confidence is None:
+            return None
+        info = self._confidence.info
+        confidence = self._confidence.read(block, 1) * info.scales[0] + info.offsets[0]
+        return ~(confidence >= LEAST_CONFIDENCE)
 
     def _shadowed(
         self, block: Block, image: Array, rows: Array, needed: Array, sun: Array, normal: Array
@@ -204,20 +244,24 @@ class Pipeline:
         shadowed, unsure = found
         return self._by_brightness.settle(shadowed, unsure & needed, image, rows, sun, normal)
 
-    def _angle_layers(self, block: Block, inputs: BlockInputs) -> dict[str, Array]:
-        """The layers of angles and widths that are asked for, float32."""
+    def _angle_layers(self, block: Block, inputs: BlockInputs, unseen: Array | None) -> dict[str, Array]:
+        """The layers of angles and widths that are asked for, float32; nan where they need a view and are unseen."""
         layers: dict[str, Array] = {}
         if "azimuthal_width" in self._products:
             layers["azimuthal_width"] = self._azimuthal_width(inputs)[None]
         if "angles" in self._products:
             angles = facet_angles(inputs.sun, inputs.view, inputs.normal)
-            convergence = self.scene.sun.convergence_deg
             for name, vectors in (("solar", inputs.sun), ("view", inputs.view)):
                 zenith, azimuth = zenith_azimuth(vectors)
+                constant = vectors.shape[1:] == (1, 1)  # then the direction was given for the centre
+                convergence = self.scene.sun.convergence_deg if constant else self._north.convergence_deg(block)
                 angles |= {f"{name}_zenith": zenith, f"{name}_azimuth": true_azimuth(azimuth, convergence)}
             layers["angles"] = np.stack(
                 [np.broadcast_to(angles[name], block.shape).astype(np.float32) for name in ANGLE_NAMES]
             )
+            if unseen is not None:
+                of_view = [i for i, name in enumerate(ANGLE_NAMES) if name not in ANGLES_OF_SUN]
+                layers["angles"][of_view] = np.where(unseen, np.float32(np.nan), layers["angles"][of_view])
         return layers
 
     def _azimuthal_width(self, inputs: BlockInputs) -> Array:

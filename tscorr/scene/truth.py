@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 
 from tscorr import rasters
-from tscorr.errors import InputError
 from tscorr.grid import blocks
 from tscorr.scene.plan import Scene
 
@@ -22,9 +21,6 @@ def residual_glare(scene: Scene, corrected: Path) -> dict[str, float] | None:
     if truth is None:
         return None
     diffuse, sunlit = rasters.describe(truth.diffuse), rasters.describe(truth.sunlit)
-    for info in (diffuse, sunlit):
-        if info.shape != scene.image.shape:
-            raise InputError(f"the truth {info.path} has the shape {info.shape}; the image has {scene.image.shape}")
     scale, offset = (np.array(values)[:, None, None] for values in (scene.stored.scale, scene.stored.offset))
     before = after = 0.0
     count = 0

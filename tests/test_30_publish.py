@@ -1,0 +1,179 @@
+"""publish: a folder is whole or absent, and a key changes with everything that a result depends on."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from tscorr import publish
+from tscorr.errors import OutputError
+
+
+def published(target, content="new", key="k"):
+    """A published folder with two files."""
+    with publish.Publication(target) as publication:
+        (publication.folder / "a.txt").write_text(content)
+        (publication.folder / "b.txt").write_text("b")
+        publication.commit({"key": key})
+    return target
+
+
+def leftovers(folder):
+    """Hidden files and folders, which nobody should find after a run."""
+    return [path.name for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def test_a_committed_folder_has_its_files_and_a_manifest_of_their_hashes(tmp_path):
+    target = published(tmp_path / "out" / "scene")
+    manifest = json.loads((target / "manifest.json").read_text())
+    assert manifest["key"] == "k"
+    assert manifest["outputs"] == {
+        "a.txt": {"sha256": hashlib.sha256(b"new").hexdigest(), "bytes": 3},
+        "b.txt": {"sha256": hashlib.sha256(b"b").hexdigest(), "bytes": 1},
+    }
+    assert leftovers(tmp_path / "out") == []
+
+
+def test_work_is_done_beside_the_target_on_its_file_system(tmp_path):
+    with publish.Publication(tmp_path / "scene") as publication:
+        assert publication.folder.parent == tmp_path
+        assert publication.folder.name.startswith(".scene.")
+        assert not (tmp_path / "scene").exists()
+
+
+def test_an_error_leaves_nothing(tmp_path):
+    with pytest.raises(RuntimeError), publish.Publication(tmp_path / "scene") as publication:  # noqa: PT012
+        (publication.folder / "a.txt").write_text("half")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_leaves_the_old_result_as_it_was(tmp_path):
+    target = published(tmp_path / "scene", "old")
+    with pytest.raises(RuntimeError), publish.Publication(target) as publication:  # noqa: PT012
+        (publication.folder / "a.txt").write_text("half")
+        raise RuntimeError
+    assert (target / "a.txt").read_text() == "old"
+    assert publish.damaged(target) == []
+    assert leftovers(tmp_path) == []
+
+
+def test_a_new_result_replaces_the_old_one_wholly(tmp_path):
+    target = published(tmp_path / "scene", "old")
+    (target / "of_old_only.txt").write_text("x")
+    published(target, "new")
+    assert sorted(path.name for path in target.iterdir()) == ["a.txt", "b.txt", "manifest.json"]
+    assert (target / "a.txt").read_text() == "new"
+    assert leftovers(tmp_path) == []
+
+
+def test_a_commit_that_fails_is_an_output_error_and_leaves_the_old_result(tmp_path, monkeypatch):
+    target = published(tmp_path / "scene", "old")
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputError, match=r"scene cannot be published: .*No space left"):
+        published(target)
+    assert (target / "a.txt").read_text() == "old"
+    assert leftovers(tmp_path) == []
+
+
+def test_everything_is_flushed_before_the_rename_and_the_manifest_is_last(tmp_path, monkeypatch):
+    flushed = []
+    monkeypatch.setattr(publish, "_flush", lambda path: flushed.append((path.name, (tmp_path / "scene").exists())))
+    published(tmp_path / "scene")
+    names = [name for name, _ in flushed]
+    assert names[:3] == ["a.txt", "b.txt", "manifest.json"]
+    assert [done for _, done in flushed] == [False] * (len(flushed) - 1) + [True]
+
+
+def test_a_folder_that_cannot_be_made_is_an_output_error(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with (
+        pytest.raises(OutputError, match=f"the output folder {tmp_path / 'file'} cannot be written"),
+        publish.Publication(tmp_path / "file" / "scene"),
+    ):
+        pass
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from tscorr import publish
+
+with publish.Publication(Path(sys.argv[1])) as publication:
+    (publication.folder / "a.txt").write_text("new")
+    steps = 0
+    def flush(path, real=publish._flush):
+        global steps
+        steps += 1
+        if steps == int(sys.argv[2]):
+            os.kill(os.getpid(), signal.SIGKILL)
+        real(path)
+    publish._flush = flush
+    publication.commit({"key": "k"})
+"""
+
+
+@pytest.mark.parametrize("step", range(1, 5))
+def test_a_killed_commit_leaves_the_old_or_the_new_result_whole(tmp_path, step):
+    target = published(tmp_path / "scene", "old")
+    result = subprocess.run([sys.executable, "-c", KILLED, target, str(step)], check=False)
+    assert result.returncode == -signal.SIGKILL
+    assert publish.damaged(target) == []
+    assert (target / "a.txt").read_text() == ("new" if step == 4 else "old")
+    published(target, "next")
+    assert (target / "a.txt").read_text() == "next"
+
+
+def test_equal_content_has_an_equal_key_and_every_change_changes_it(tmp_path):
+    file = tmp_path / "input"
+    file.write_text("x")
+    settings = {"a": 1, "b": [1, 2]}
+    key = publish.key(settings, [file], "1.0")
+    assert publish.key({"b": [1, 2], "a": 1}, [file], "1.0") == key
+    assert publish.key({**settings, "a": 2}, [file], "1.0") != key
+    assert publish.key(settings, [file], "1.1") != key
+    assert publish.key(settings, [file, file], "1.0") != key
+    os.utime(file, ns=(1, 1))
+    touched = publish.key(settings, [file], "1.0")
+    assert touched != key
+    file.write_text("xy")
+    os.utime(file, ns=(1, 1))
+    assert publish.key(settings, [file], "1.0") != touched
+
+
+def test_a_result_is_current_only_with_its_key_and_all_its_files(tmp_path):
+    target = published(tmp_path / "scene")
+    assert publish.is_current(target, "k")
+    assert not publish.is_current(target, "other")
+    assert not publish.is_current(tmp_path / "nix", "k")
+    (target / "a.txt").write_text("longer than it was")
+    assert not publish.is_current(target, "k")
+    (target / "a.txt").unlink()
+    assert not publish.is_current(target, "k")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"key": "k"', "{}"])
+def test_a_manifest_that_is_none_makes_no_result_current(tmp_path, text):
+    target = published(tmp_path / "scene")
+    (target / "manifest.json").write_text(text)
+    assert not publish.is_current(target, "k")
+    assert publish.damaged(target)
+
+
+def test_damage_is_found_by_hash(tmp_path):
+    target = published(tmp_path / "scene")
+    assert publish.damaged(target) == []
+    (target / "a.txt").write_text("nex")  # as long as before
+    (target / "b.txt").unlink()
+    assert publish.damaged(target) == [
+        f"{target / 'a.txt'} has changed since it was published",
+        f"{target / 'b.txt'} is missing",
+    ]
