@@ -74,13 +74,13 @@ def plot(result: dict[str, Any], path: str | Path) -> None:
         for entry, _ in of_form:
             x, y = entry["ns_per_pixel"], entry[ERROR]
             axes.plot(x, y, marker="o" if _images(entry) else "^", color=f"C{number}")
-            below = number == 1
+            left = number == 1 and _images(entry)
             axes.annotate(
                 entry["name"],
                 (x, y),
                 textcoords="offset points",
-                xytext=(-6, -11) if below else (6, 5),
-                ha="right" if below else "left",
+                xytext=(-6 if left else 6, -11 if number == 1 else 5),
+                ha="right" if left else "left",
                 fontsize=8,
                 color=f"C{number}",
             )
