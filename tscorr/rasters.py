@@ -56,7 +56,7 @@ class RasterInfo:
     tags: dict[str, str]
     band_tags: tuple[dict[str, dict[str, str]], ...]
     """for each band, tags by domain ('' and 'IMAGERY')"""
-    colors: tuple[ColorInterp, ...]
+    colors: tuple[ColorInterp, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -381,7 +381,7 @@ class Writer:
                         dataset.update_tags(index, ns=domain, **tags)
                     else:
                         dataset.update_tags(index, **tags)
-        if layer.of_image and ColorInterp.palette not in like.colors:
+        if layer.of_image and like.colors and ColorInterp.palette not in like.colors:
             dataset.colorinterp = like.colors  # else GDAL takes the fourth of four bytes for transparency
         if layer.scales is not None:
             dataset.scales, dataset.offsets = layer.scales, layer.offsets

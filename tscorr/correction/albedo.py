@@ -23,6 +23,8 @@ Array = NDArray[Any]
 
 RING_NODES, TILT_NODES = 20, 24
 """nodes between two kinks: on a ring of facets of one tilt, and over the tilts"""
+NO_SWING = 1e-12
+"""a quantity that swings by less over a ring has no kink on it"""
 REACH = 6.5
 """w alpha beyond which the exponential, below 5e-19, is left out"""
 
@@ -113,7 +115,7 @@ def _ring_kinks(cos_i: float, cos_a: Array, middle: Array, swing: Array) -> Arra
     curvature = 4 * cos_a**2 - 1
     masking = np.where(curvature > 0, shadowing / np.where(curvature > 0, curvature, 1), 2.0)
     x = np.stack([horizon, shadowing, masking])
-    cosine = np.clip((x - middle) / np.where(swing > 0, swing, 1), -1, 1)
+    cosine = np.clip((x - middle) / np.where(swing > NO_SWING, swing, 1), -1, 1)
     ends = np.zeros((1, *cos_a.shape))
     return np.sort(np.concatenate([ends, np.arccos(cosine), ends + np.pi]), axis=0)
 
