@@ -1,0 +1,24 @@
+"""Rasters on disk: open and check, align on the fly, read a block, write a block.
+
+GDAL never applies scale and offset; neither does anything here: blocks hold stored values.
+"""
+
+from tscorr.rasters.header import IMAGE_TYPES, RasterInfo, can_hold, check_metric, check_overlap, describe, opened
+from tscorr.rasters.reading import Reader, read_decimated, read_decimated_flags
+from tscorr.rasters.writing import Layer, Writer, make_cog
+
+__all__ = [
+    "IMAGE_TYPES",
+    "Layer",
+    "RasterInfo",
+    "Reader",
+    "Writer",
+    "can_hold",
+    "check_metric",
+    "check_overlap",
+    "describe",
+    "make_cog",
+    "opened",
+    "read_decimated",
+    "read_decimated_flags",
+]

@@ -1,0 +1,206 @@
+"""What the header of a raster says, checked before a pixel is read."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from rasterio.enums import ColorInterp, Interleaving
+from rasterio.errors import RasterioError
+from rasterio.warp import transform_bounds
+
+from tscorr.errors import InputError
+from tscorr.grid import Grid
+
+DRIVERS = ["GTiff", "ENVI", "HFA", "JP2OpenJPEG", "PNG", "JPEG", "AAIGrid", "EHdr"]
+"""formats that are opened; a VRT from an unknown hand may name any file of the machine"""
+LARGEST_TILE_BYTES = 256e6
+IMAGE_TYPES = ("uint8", "int16", "uint16", "float32")
+ENVIRONMENT = {"GDAL_CACHEMAX": 64, "GDAL_NUM_THREADS": "1"}
+
+
+@dataclass(frozen=True, slots=True)
+class RasterInfo:
+    """What the header of a raster says. Tuples hold one value a band."""
+
+    path: Path
+    grid: Grid
+    bands: int
+    dtype: np.dtype[Any]
+    nodata: float | None
+    scales: tuple[float, ...]
+    offsets: tuple[float, ...]
+    names: tuple[str, ...]
+    wavelengths_um: tuple[float, ...] | None
+    fwhm_um: tuple[float, ...] | None
+    tile: tuple[int, int]
+    """(rows, cols) that are stored together"""
+    profile: dict[str, Any]
+    """creation options with which a GeoTIFF like this one is written"""
+    tags: dict[str, str]
+    band_tags: tuple[dict[str, dict[str, str]], ...]
+    """for each band, tags by domain ('' and 'IMAGERY')"""
+    colors: tuple[ColorInterp, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols)."""
+        return self.grid.shape
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """A dataset open for reading; InputError names the file where GDAL cannot."""
+    try:
+        with rasterio.Env(**ENVIRONMENT), rasterio.open(path, sharing=False) as dataset:
+            if dataset.driver not in DRIVERS:
+                allowed = ", ".join(DRIVERS)
+                raise InputError(f"{path} is in the format {dataset.driver}; allowed are {allowed}")
+            yield dataset
+    except RasterioError as error:
+        raise InputError(f"{path} cannot be read: {reason_of(error, path)}") from None
+
+
+def describe(path: str | Path) -> RasterInfo:
+    """The header of a raster, checked before a pixel is read.
+
+    Raises InputError where the file is missing, is no raster, or declares tiles that no honest file has.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path} does not exist")
+    with opened(path) as dataset:
+        dtypes = set(dataset.dtypes)
+        if dataset.count < 1 or len(dtypes) != 1:
+            raise InputError(f"{path} has bands of the types {sorted(dtypes)}; allowed is one type")
+        dtype = np.dtype(dtypes.pop())
+        rows, cols = dataset.block_shapes[0]
+        at_once = rows * cols * dtype.itemsize
+        at_once *= dataset.count if dataset.interleaving == Interleaving.pixel else 1
+        if at_once > LARGEST_TILE_BYTES:
+            raise InputError(
+                f"{path} is stored in tiles of {rows} x {cols} pixels, {at_once / 1e6:.0f} MB each; "
+                f"allowed are {LARGEST_TILE_BYTES / 1e6:.0f} MB"
+            )
+        wavelengths, widths = _wavelengths(dataset)
+        return RasterInfo(
+            path=path,
+            grid=Grid(dataset.crs, dataset.transform, dataset.shape),
+            bands=dataset.count,
+            dtype=dtype,
+            nodata=dataset.nodata if can_hold(dtype, dataset.nodata) else None,
+            scales=tuple(dataset.scales),
+            offsets=tuple(dataset.offsets),
+            names=tuple(name or f"band {i + 1}" for i, name in enumerate(dataset.descriptions)),
+            wavelengths_um=wavelengths,
+            fwhm_um=widths,
+            tile=(rows, cols),
+            profile=_profile(dataset),
+            tags=dataset.tags(),
+            band_tags=tuple({ns: dataset.tags(i, ns=ns) for ns in ("", "IMAGERY")} for i in dataset.indexes),
+            colors=tuple(dataset.colorinterp),
+        )
+
+
+def can_hold(dtype: np.dtype[Any], value: float | None) -> bool:
+    """Whether a pixel of this type can have the value."""
+    if value is None:
+        return False
+    if dtype.kind in "iu":
+        return float(value).is_integer() and np.iinfo(dtype).min <= value <= np.iinfo(dtype).max
+    return not np.isfinite(value) or abs(value) <= float(np.finfo(dtype).max)
+
+
+def _profile(dataset: Any) -> dict[str, Any]:
+    """Tiling, interleave and codec of a GeoTIFF; a tiled one with a fast codec for other formats."""
+    structure = dataset.tags(ns="IMAGE_STRUCTURE")
+    rows, cols = dataset.block_shapes[0]
+    profile: dict[str, Any] = {"interleave": "pixel" if dataset.interleaving == Interleaving.pixel else "band"}
+    if dataset.driver != "GTiff":
+        return {**profile, "tiled": True, "blockxsize": 512, "blockysize": 512, "compress": "zstd"}
+    if cols < dataset.width or rows % 16 == 0 == cols % 16:
+        profile |= {"tiled": True, "blockxsize": cols, "blockysize": rows}
+    else:
+        profile |= {"tiled": False, "blockysize": rows}
+    codec = structure.get("COMPRESSION", "NONE").lower()
+    lossless = {"deflate", "lzw", "zstd", "packbits", "lzma", "none"}
+    profile["compress"] = codec if codec in lossless else "deflate"
+    if "PREDICTOR" in structure:
+        profile["predictor"] = int(structure["PREDICTOR"])
+    return profile
+
+
+def _wavelengths(dataset: Any) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+    """Band centres and widths [um] from the IMAGERY domain, or from the ENVI style tags of the bands."""
+    centres, widths = [], []
+    for index in dataset.indexes:
+        imagery, plain = dataset.tags(index, ns="IMAGERY"), dataset.tags(index)
+        centres.append(_length_um(imagery.get("CENTRAL_WAVELENGTH_UM"), "um"))
+        if centres[-1] is None:
+            centres[-1] = _length_um(plain.get("wavelength"), plain.get("wavelength_units", ""))
+        widths.append(_length_um(imagery.get("FWHM_UM"), "um"))
+    complete = all(value is not None for value in centres)
+    with_widths = complete and all(value is not None for value in widths)
+    return (tuple(centres) if complete else None, tuple(widths) if with_widths else None)  # type: ignore[arg-type]
+
+
+def _length_um(text: str | None, unit: str) -> float | None:
+    try:
+        value = float(text or "")
+    except ValueError:
+        return None
+    factors = {
+        "um": 1.0,
+        "micrometers": 1.0,
+        "micrometer": 1.0,
+        "nm": 1e-3,
+        "nanometers": 1e-3,
+        "nanometer": 1e-3,
+    }
+    return value * factors.get(unit.strip().lower(), 1e-3 if value > 100 else 1.0)
+
+
+def check_overlap(raster: RasterInfo, image: RasterInfo, what: str) -> None:
+    """Raise InputError unless a raster has a CRS and shares ground with the image."""
+    if image.grid.crs is None:
+        raise InputError(f"the image {image.path} has no CRS; {what} {raster.path} cannot be laid over it")
+    if raster.grid.crs is None:
+        raise InputError(f"{what} {raster.path} has no CRS; it must say where it is")
+    try:
+        with rasterio.Env():
+            west, south, east, north = transform_bounds(raster.grid.crs, image.grid.crs, *_bounds(raster.grid))
+    except Exception as error:  # noqa: BLE001 - rasterio raises PROJ's errors unwrapped
+        raise InputError(
+            f"{what} {raster.path} is in a CRS that cannot be turned into that of the image {image.path}: "
+            f"{str(error).splitlines()[0][:200]}"
+        ) from None
+    left, bottom, right, top = _bounds(image.grid)
+    if not (west < right and east > left and south < top and north > bottom):
+        raise InputError(
+            f"{what} {raster.path} covers x {west:.0f} to {east:.0f}, y {south:.0f} to {north:.0f}; it does not "
+            f"overlap the image {image.path}, x {left:.0f} to {right:.0f}, y {bottom:.0f} to {top:.0f}"
+        )
+
+
+def check_metric(raster: RasterInfo, what: str) -> None:
+    """Raise InputError unless the CRS is projected, in metres: slopes and shadows need true lengths."""
+    crs = raster.grid.crs
+    if crs is None:
+        raise InputError(f"{what} {raster.path} has no CRS; allowed is a projected CRS in metres")
+    if crs.is_geographic or crs.linear_units_factor[1] != 1.0:
+        unit = "degrees" if crs.is_geographic else crs.linear_units
+        raise InputError(f"{what} {raster.path} is in {unit}; allowed is a projected CRS in metres")
+
+
+def _bounds(grid: Grid) -> tuple[float, float, float, float]:
+    xs, ys = grid.corners()
+    return float(xs.min()), float(ys.min()), float(xs.max()), float(ys.max())
+
+
+def reason_of(error: Exception, path: Path) -> str:
+    """GDAL's message without the path that stands before it anyway."""
+    text = str(error.__cause__ or error)
+    return text.replace(f"{path}: ", "").replace(f"'{path}' ", "").strip()

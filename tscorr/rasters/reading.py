@@ -1,0 +1,172 @@
+"""Blocks of a raster, or of a raster laid over another grid."""
+
+import threading
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.enums import Resampling
+from rasterio.errors import RasterioError
+from rasterio.vrt import WarpedVRT
+
+from tscorr.errors import InputError
+from tscorr.grid import Block, Grid
+from tscorr.rasters.header import ENVIRONMENT, RasterInfo, opened, reason_of
+
+Array = NDArray[Any]
+
+MISALIGNED_PIXELS = 0.01
+"""pixels of two grids that are off by less than this coincide"""
+
+
+class Reader:
+    """Blocks of a raster, or of a raster laid over another grid; any thread may read.
+
+    grid       : the grid that blocks are of; None for the raster's own.
+    resampling : how values are found on another grid.
+    fill       : value outside the raster, and of nodata where `fill` is nan.
+    margin     : pixels beyond the grid that a block may reach.
+    """
+
+    def __init__(
+        self,
+        info: RasterInfo,
+        grid: Grid | None = None,
+        *,
+        resampling: Resampling = Resampling.nearest,
+        fill: float = 0,
+        margin: int = 0,
+    ) -> None:
+        self.info = info
+        self._grid = grid or info.grid
+        self._resampling = resampling
+        self._fill = fill
+        self._margin = margin
+        shift = _pixel_shift(info.grid, self._grid)
+        self._aligned = shift is not None
+        self._shift = shift if shift is not None else (margin, margin)
+        self._local = threading.local()
+        self._handles: list[Any] = []
+        self._lock = threading.Lock()
+
+    def read(self, block: Block, bands: int | None = None) -> Array:
+        """Stored values of a block: (bands, rows, cols), or (rows, cols) of one band."""
+        try:
+            return self._read(block, bands)
+        except RasterioError as error:
+            place = f"rows {block.row} to {block.row + block.height}, columns {block.col} to {block.col + block.width}"
+            raise InputError(
+                f"{self.info.path} cannot be read at {place}: {reason_of(error, self.info.path)}"
+            ) from None
+
+    def _read(self, block: Block, bands: int | None) -> Array:
+        dataset = self._dataset()
+        row, col = block.row + self._shift[0], block.col + self._shift[1]
+        top, left = max(row, 0), max(col, 0)
+        bottom, right = min(row + block.height, dataset.height), min(col + block.width, dataset.width)
+        inside = Block(top, left, bottom - top, right - left)
+        whole = inside.shape == block.shape
+        if whole:
+            values = dataset.read(bands, window=inside.window)
+        else:
+            leading = () if bands is not None else (self.info.bands,)
+            values = np.full((*leading, *block.shape), self._fill, self._out_type())
+            if inside.height > 0 and inside.width > 0:
+                rows, cols = slice(top - row, bottom - row), slice(left - col, right - col)
+                values[..., rows, cols] = dataset.read(bands, window=inside.window)
+        if np.isnan(self._fill):
+            values = values.astype(np.float32, copy=False)
+            values[~np.isfinite(values)] = np.nan
+            if self.info.nodata is not None:
+                values[values == np.float32(self.info.nodata)] = np.nan
+        return values
+
+    def _out_type(self) -> np.dtype[Any]:
+        return np.dtype(np.float32) if np.isnan(self._fill) else self.info.dtype
+
+    def _dataset(self) -> Any:
+        """The handle of the calling thread."""
+        if not hasattr(self._local, "dataset"):
+            with rasterio.Env(**ENVIRONMENT):
+                source = rasterio.open(self.info.path, sharing=False)
+                dataset = source if self._aligned else self._warped(source)
+            with self._lock:
+                self._handles += [dataset] if dataset is source else [dataset, source]
+            self._local.dataset = dataset
+        return self._local.dataset
+
+    def _warped(self, source: Any) -> Any:
+        rows, cols = self._grid.shape
+        grid = self._grid.crop(Block(0, 0, rows, cols).padded(self._margin))
+        nodata = self.info.nodata if self.info.nodata is not None else self._fill
+        # Where its cells are slightly smaller than those of the grid, GDAL widens its bilinear kernel by as
+        # little, and unevenly: heights then err by a tenth of a cell times the slope.
+        similar = min(self.info.grid.cell_size) > 0.5 * max(grid.cell_size)
+        exactly_bilinear = {"XSCALE": 1, "YSCALE": 1} if similar else {}
+        return WarpedVRT(
+            source,
+            crs=grid.crs,
+            transform=grid.transform,
+            height=grid.shape[0],
+            width=grid.shape[1],
+            resampling=self._resampling,
+            nodata=nodata,
+            warp_mem_limit=64,
+            **exactly_bilinear,
+        )
+
+    def close(self) -> None:
+        """Close the handles of all threads."""
+        with self._lock:
+            for handle in self._handles:
+                handle.close()
+            self._handles.clear()
+            self._local = threading.local()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _pixel_shift(raster: Grid, grid: Grid) -> tuple[int, int] | None:
+    """Rows and columns from the raster's first pixel to the grid's, or None where pixels do not coincide."""
+    if raster.crs != grid.crs:
+        return None
+    a, b = raster.transform, grid.transform
+    rows, cols = grid.shape
+    corner_a, corner_b = raster.rowcol(*grid.xy(0, 0)), raster.rowcol(*grid.xy(rows - 1, cols - 1))
+    shift = round(float(corner_a[0])), round(float(corner_a[1]))
+    drift = (
+        np.abs(np.subtract(corner_a, shift)).max(),
+        np.abs(np.subtract(corner_b, (shift[0] + rows - 1, shift[1] + cols - 1))).max(),
+    )
+    same_axes = np.allclose([a.a, a.b, a.d, a.e], [b.a, b.b, b.d, b.e], rtol=1e-6, atol=1e-12)
+    return shift if same_axes and max(drift) < MISALIGNED_PIXELS else None
+
+
+def read_decimated(info: RasterInfo, max_size: int, bands: Sequence[int] | None = None) -> Array:
+    """Stored values of a raster (bands, rows, cols), float32, no side longer than `max_size`.
+
+    Averages; nan where nodata or an infinite value is among them; overviews are used where the file has them.
+    """
+    rows, cols = info.shape
+    step = max(1.0, max(rows, cols) / max_size)
+    shape = max(1, round(rows / step)), max(1, round(cols / step))
+    indexes = list(bands or range(1, info.bands + 1))
+    with opened(info.path) as dataset:
+        values = dataset.read(indexes, out_shape=(len(indexes), *shape), resampling=Resampling.average, masked=True)
+    filled = np.ma.filled(values.astype(np.float32), np.nan)
+    filled[~np.isfinite(filled)] = np.nan
+    return filled
+
+
+def read_decimated_flags(info: RasterInfo, max_size: int) -> Array:
+    """A flag layer on the pixels of `read_decimated`: (rows, cols), the nearest value."""
+    rows, cols = info.shape
+    step = max(1.0, max(rows, cols) / max_size)
+    with opened(info.path) as dataset:
+        return dataset.read(1, out_shape=(max(1, round(rows / step)), max(1, round(cols / step))))
