@@ -15,7 +15,6 @@ from tscorr.report.facts import Array, SceneFacts
 from tscorr.report.histograms import INCIDENCE_BIN_DEG, SHARE_BIN, TILT_BIN_DEG, above, quantile
 from tscorr.width import (
     LobeShape,
-    WidthTable,
     azimuthal_width,
     critical_roof,
     crossover_incidence,
@@ -23,6 +22,7 @@ from tscorr.width import (
     heading_table,
     lobe_shapes,
     width_rows,
+    width_table,
     zenithal_width,
 )
 
@@ -165,7 +165,7 @@ def _widths(lobe: LobeShape, form: str, incidence: Array) -> dict[str, Any]:
 
     All of them fall with incidence, so that a quantile of a width is the width at a quantile of incidence.
     """
-    table = WidthTable(lobe, form)
+    table = width_table(lobe, form)
 
     def arc(incidence_deg: float) -> float:
         return float(table.at(incidence_deg) * math.sin(math.radians(incidence_deg)))

@@ -29,7 +29,7 @@ from tscorr.correction.edges import ShadowByBrightness
 from tscorr.grid import Block, blocks, north_of
 from tscorr.scene.ground import Ground
 from tscorr.scene.plan import Scene
-from tscorr.width import WidthTable, lobe_shapes
+from tscorr.width import lobe_shapes, width_table
 
 Array = NDArray[Any]
 Progress = Callable[[int], None]
@@ -142,7 +142,7 @@ class Pipeline:
         self._products = set(scene.config.output.products)
         self._north = north_of(scene.grid)
         self._tables = [
-            WidthTable(shapes[len(shapes) // 2], rules.form) if peak else None
+            width_table(shapes[len(shapes) // 2], rules.form) if peak else None
             for (_, parameters, rules), peak in zip(scene.materials, self.corrector.peaks[1:], strict=True)
             for shapes in [lobe_shapes(parameters)]
         ]

@@ -12,6 +12,7 @@ from tscorr.width.azimuthal import (
     smallest_incidence,
     why_no_width,
     width_across,
+    width_table,
 )
 from tscorr.width.lobe import LobeShape, lobe_shape, lobe_shapes
 from tscorr.width.reach import cutoff_tilt, f_spec_bound
@@ -36,5 +37,6 @@ __all__ = [
     "why_no_width",
     "width_across",
     "width_rows",
+    "width_table",
     "zenithal_width",
 ]

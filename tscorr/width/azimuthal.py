@@ -9,6 +9,7 @@ lobe on the ring of one incidence and one exitance depends on u alone:
 so the half maximum is one root in u, and the full width at half maximum is 2 psi = 4 asin(sqrt(u)).
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -151,6 +152,12 @@ class WidthTable:
         incidence = np.asarray(incidence_deg)
         width = np.interp(incidence, self._nodes, self._widths, left=np.nan, right=np.nan)
         return np.asarray(np.where(incidence < 90, width, np.nan), dtype=np.float32)
+
+
+@lru_cache(maxsize=256)
+def width_table(shape: LobeShape, form: str = "full") -> WidthTable:
+    """The table of a lobe, remembered: a batch asks for the same materials scene by scene."""
+    return WidthTable(shape, form)
 
 
 class _Ring(NamedTuple):

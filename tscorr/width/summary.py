@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +33,12 @@ def width_rows(
     Azimuthal width and arc are of the whole lobe at exitance = incidence, the zenithal width of the
     exponential alone, cut at the horizon.
     """
-    shape = lobe_shape(m, wavelength_um)
+    rows = _rows(lobe_shape(m, wavelength_um), tuple(incidences_deg), form)
+    return [dict(row) for row in rows]
+
+
+@lru_cache(maxsize=256)  # a batch asks for the same materials scene by scene
+def _rows(shape: LobeShape, incidences_deg: tuple[float, ...], form: str) -> list[dict[str, float | None]]:
     incidence = np.asarray(incidences_deg, dtype=float)
     columns = {
         "incidence_deg": incidence,
@@ -122,9 +128,10 @@ def _max_share(
     geometry: reference.Geometry, bands: BandParameters, direct_fraction: ArrayLike, *, simplified: bool
 ) -> float:
     """Largest specular share over the bands and the directions of a geometry (n,)."""
-    w, n, k = (column[:, np.newaxis] for column in (bands.w, bands.n, bands.k))
-    f_spec = reference.specular(geometry, w, n, k, simplified=simplified)
-    peak = np.asarray(direct_fraction) * bands.t1 * f_spec.max(axis=1)
+    lobes, lobe_of_band = np.unique(np.stack([bands.w, bands.n, bands.k]), axis=1, return_inverse=True)
+    w, n, k = lobes[..., np.newaxis]
+    f_spec = reference.specular(geometry, w, n, k, simplified=simplified).max(axis=1)
+    peak = np.asarray(direct_fraction) * bands.t1 * f_spec[lobe_of_band]
     total = peak + bands.t0
     return float((peak / np.where(total > 0, total, 1)).max())
 
