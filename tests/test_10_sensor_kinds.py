@@ -388,3 +388,10 @@ def test_images_of_one_row_or_pixel(shape):
         look = view.look(grid, Block(0, 0, *shape), np.full((1, 1), 300.0))
         np.testing.assert_allclose(look.vectors[:, 0, 0], [0, 0, 1], atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(look.vectors, axis=0), 1, atol=1e-14)
+
+
+def test_a_camera_in_degrees_is_refused():
+    grid = Grid(CRS.from_epsg(28992), Affine(0.5, 0, 84664, 0, -0.5, 447719), (576, 848))
+    with pytest.raises(InputError, match="far too low to see it; allowed is a position in the CRS of the image"):
+        FrameView((52.0, 4.3, 702.0)).check(grid, 20.0)
+    FrameView((84844.0, 447593.0, 702.0)).check(grid, 20.0)

@@ -237,11 +237,11 @@ def test_an_interruption_leaves_nothing_half_done(tmp_path):
     assert states(config) == {"a": "current", "b": "done"}
 
 
-def test_an_output_folder_that_cannot_be_made_fails_the_scene(tmp_path):
+def test_an_output_folder_that_cannot_be_made_is_found_before_work(tmp_path):
     (tmp_path / "out").write_text("a file")
-    result = batch.run(small_scene(tmp_path))
-    assert result.exit_code == 3
-    assert f"{tmp_path / 'out'} cannot be written" in result.scenes[0].error
+    with pytest.raises(ConfigError, match=r"\[output\] directory = .*out is not a folder"):
+        batch.run(small_scene(tmp_path))
+    assert (tmp_path / "out").read_text() == "a file"
 
 
 def test_progress_counts_every_pixel(tmp_path):

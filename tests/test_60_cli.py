@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -569,3 +570,10 @@ def test_the_version_is_that_of_the_package_and_is_stamped_into_the_outputs(tmp_
     tscorr("run", small_scene(tmp_path))
     with rasterio.open(tmp_path / "out/roofs/corrected.tif") as file:
         assert file.tags()["TSCORR_VERSION"] == __version__
+
+
+def test_plan_and_report_agree_on_the_views():
+    planned = json.loads(tscorr("plan", Path(__file__).parent.parent / "configs" / "delft.toml", "--json").stdout)[
+        "scenes"
+    ][1]
+    assert planned["view_zenith_deg"] == pytest.approx([0.0, 11.4, 22.6], abs=0.6)  # the sample's README

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -88,10 +89,22 @@ def plan(settings: config.Config, scenes: Sequence[str] = (), materials: Sequenc
             planned.append(plan_scene(scene, settings, library, materials))
         except TscorrError as error:
             problems.append((f"scene '{scene.name}': {error}", type(error)))
+    if not problems:
+        _check_output(Path(settings.output.directory))
     if problems:
         kind = problems[0][1] if len(problems) == 1 else InputError
         raise kind("\n".join(message for message, _ in problems))
     return planned
+
+
+def _check_output(folder: Path) -> None:
+    """Raise ConfigError unless the output folder, or what exists of the way to it, can be written."""
+    existing = folder
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        what = "cannot be written" if existing.is_dir() else "is not a folder"
+        raise ConfigError(f"[output] directory = {folder}: {existing} {what}; allowed is a folder that can be made")
 
 
 def run(

@@ -114,7 +114,8 @@ def print_outcome(result: "BatchResult") -> None:
         if (residual := scene.report.get("residual_glare")) is not None:
             notes.append(
                 f"{scene.name}: residual glare {residual['rms_before']:.4f} before, {residual['rms_after']:.4f} after "
-                f"(RMS of reflectance against the truth): {residual['ratio']:.3f} of it is left"
+                f"(RMS of reflectance against the truth)"
+                + (f": {residual['ratio']:.3f} of it is left" if residual["ratio"] is not None else "")
             )
         if scene.state == "current":
             notes.append(f"{scene.name}: nothing to do, the result is current")
@@ -161,8 +162,8 @@ def plan(config: Path, as_json: bool) -> None:
     for entry in forecasts:
         click.echo(f"{entry['scene']}: {entry['image']}, {entry['rows']} x {entry['cols']} x {entry['bands']}")
         click.echo(f"  sun zenith {entry['sun']['zenith_deg']:.2f}, azimuth {entry['sun']['azimuth_deg']:.2f} degrees")
-        low, middle, high = entry["view_zenith_deg"]
-        click.echo(f"  view zenith {low:.1f} to {high:.1f}, middle {middle:.1f} degrees")
+        low, middle, high = entry["view_zenith_deg"] or (float("nan"),) * 3
+        click.echo(f"  view zenith {low:.1f} to {high:.1f}, median {middle:.1f} degrees")
         for name, share in entry["materials"].items():
             click.echo(f"  {name}: {100 * share:.1f} % of the pixels")
         click.echo(f"  no material: {100 * entry['no_material']:.1f} % of the pixels")

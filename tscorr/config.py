@@ -394,6 +394,10 @@ def _problem(path: Path, item: Mapping[str, Any]) -> str:
         table = ".".join(map(str, place)) or "the top level"
         return f"{path}: unknown key '{key}' in {table}{nearest(str(key), known)}"
     message = item["msg"].removeprefix("Value error, ")
+    if item["type"] == "union_tag_invalid":
+        kinds = SURFACES if location[-1] == "surface" else VIEWS
+        kind = str(item["input"].get("kind"))
+        return f"{path}: {where}.kind = '{kind}'; allowed are {', '.join(kinds)}{nearest(kind, kinds)}"
     if item["type"] == "missing":
         return f"{path}: {where} is missing"
     if where == "file":

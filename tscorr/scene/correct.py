@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import tomli_w
+from affine import Affine
 from numpy.typing import NDArray
 
 from tscorr import __version__, publish, rasters, stac
@@ -82,7 +83,7 @@ def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
 
 def facts_of(scene: Scene, pipeline: Pipeline, wall_s: float) -> SceneFacts:
     """What the report needs to know of a finished scene."""
-    zenith, azimuth = _view_samples(scene)
+    zenith, azimuth = view_samples(scene)
     sun, sums = scene.sun, pipeline.sums
     middle = zenith.shape[0] // 2, zenith.shape[1] // 2
     centre = float(zenith[middle]), float(azimuth[middle])
@@ -111,14 +112,15 @@ def facts_of(scene: Scene, pipeline: Pipeline, wall_s: float) -> SceneFacts:
     )
 
 
-def _view_samples(scene: Scene) -> tuple[Array, Array]:
+def view_samples(scene: Scene) -> tuple[Array, Array]:
     """View zenith angle and azimuth from true north on a coarse grid over the scene; nan where unseen. [deg]"""
     rows, cols = scene.image.shape
     if scene.seen.layers:
         return _view_pixels(scene)
     count_rows, count_cols = min(rows, VIEW_SAMPLES), min(cols, VIEW_SAMPLES)
-    step = scene.grid.transform.scale(cols / count_cols, rows / count_rows)
-    coarse = Grid(scene.grid.crs, scene.grid.transform @ step, (count_rows, count_cols))
+    t, wide, high = scene.grid.transform, cols / count_cols, rows / count_rows
+    coarser = Affine(t.a * wide, t.b * high, t.c, t.d * wide, t.e * high, t.f)
+    coarse = Grid(scene.grid.crs, coarser, (count_rows, count_cols))
     block = Block(0, 0, count_rows, count_cols)
     look = scene.view.look(coarse, block, np.full((1, 1), scene.ground_level_m))
     vectors = np.broadcast_to(look.vectors, (3, count_rows, count_cols))

@@ -5,10 +5,8 @@ from typing import Any
 import numpy as np
 
 from tscorr import publish
-from tscorr.angles import zenith_azimuth
 from tscorr.correction import Corrector, class_rows
-from tscorr.grid import Block
-from tscorr.scene.correct import resume_key, target_of
+from tscorr.scene.correct import resume_key, target_of, view_samples
 from tscorr.scene.plan import Scene
 from tscorr.scene.run import units_of, workers_of
 
@@ -33,9 +31,8 @@ def forecast(scene: Scene) -> dict[str, Any]:
     per_pixel = sum(PRODUCT_BYTES.get(product, image_bytes) for product in scene.config.output.products)
     largest = max(block.height * block.width for block in cut)
     per_worker = largest * (2 * image_bytes + 60) / 1e6
-    corners = [Block(row, col, 1, 1) for row in (0, rows // 2, rows - 1) for col in (0, cols // 2, cols - 1)]
-    vectors = [scene.view.vectors(scene.grid, corner, np.full((1, 1), scene.ground_level_m)) for corner in corners]
-    zenith = np.array([float(zenith_azimuth(vector)[0].ravel()[0]) for vector in vectors])
+    zenith, _ = view_samples(scene)
+    zenith = zenith[np.isfinite(zenith)]
     return {
         "scene": scene.name,
         "image": scene.image.path.name,
@@ -43,7 +40,7 @@ def forecast(scene: Scene) -> dict[str, Any]:
         "cols": cols,
         "bands": scene.image.bands,
         "sun": {"zenith_deg": scene.sun.zenith_deg, "azimuth_deg": scene.sun.azimuth_deg},
-        "view_zenith_deg": [float(zenith.min()), float(np.median(zenith)), float(zenith.max())],
+        "view_zenith_deg": [float(np.quantile(zenith, q)) for q in (0, 0.5, 1)] if zenith.size else None,
         "materials": {
             surface.name: float(counts[row] / total) for row, (surface, _, _) in enumerate(scene.materials, start=1)
         },

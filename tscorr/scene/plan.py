@@ -144,6 +144,13 @@ def _class_map(settings: config.Scene, whole: config.Config, image: rasters.Rast
     class_map = _single_band(settings.class_map, image, "the class map")
     if class_map.dtype.kind not in "iu":
         raise InputError(f"the class map {class_map.path} holds {class_map.dtype} values; allowed are integers")
+    limits = np.iinfo(class_map.dtype)
+    for value in whole.materials.classes:
+        if not limits.min <= value <= limits.max:
+            raise InputError(
+                f"[materials.classes] has the class {value}, but the class map {class_map.path} holds "
+                f"{class_map.dtype} values; allowed are {limits.min} to {limits.max}"
+            )
     if class_map.nodata in whole.materials.classes:
         raise InputError(
             f"the class map {class_map.path} has the nodata value {class_map.nodata:g}, which is also a class of "

@@ -11,7 +11,7 @@ from tscorr.scene.plan import Scene
 LEAST_SHARE = 0.05
 
 
-def residual_glare(scene: Scene, corrected: Path) -> dict[str, float] | None:
+def residual_glare(scene: Scene, corrected: Path) -> dict[str, float | None] | None:
     """RMS error of the image and of its correction against the truth, and their ratio; None without a truth.
 
     Over the bands of valid, sunlit pixels without a saturated band whose true specular share exceeds 5 % in
@@ -38,12 +38,14 @@ def residual_glare(scene: Scene, corrected: Path) -> dict[str, float] | None:
             seen = stored * scale + offset
             specular = seen - wanted
             valid &= (specular > LEAST_SHARE * seen).any(axis=0)
-            left = result.read(block) * scale + offset - wanted
+            corrected = result.read(block)
+            valid &= (corrected != scene.stored.nodata).all(axis=0)  # uncorrectable = "nodata" claims nothing
+            left = corrected * scale + offset - wanted
             before += float((specular[:, valid] ** 2).sum())
             after += float((left[:, valid] ** 2).sum())
             count += int(valid.sum())
     pixels = max(1, count * scene.image.bands)
-    ratio = np.sqrt(after / before) if before > 0 else float("nan")
+    ratio = float(np.sqrt(after / before)) if before > 0 else None
     return {
         "pixels": count,
         "rms_before": np.sqrt(before / pixels),

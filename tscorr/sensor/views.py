@@ -68,6 +68,10 @@ class ConstantView(View):
         """A constant view sees any grid."""
 
 
+FARTHEST_OF_HEIGHT = 20
+"""a camera farther away than this times its height, 87 degrees from the zenith, has another CRS than said"""
+
+
 @dataclass(frozen=True)
 class FrameView(View):
     """A frame camera: all pixels are seen from one projection centre, in coordinates of the grid. [m]"""
@@ -80,12 +84,18 @@ class FrameView(View):
         return Look(unit(self.position[0] - x, self.position[1] - y, self.position[2] - heights))
 
     def check(self, grid: Grid, highest_m: float) -> None:
-        """The camera must be above the highest point of the scene."""
-        del grid
+        """The camera must be above the highest point of the scene, and not beyond its horizon."""
         if not self.position[2] > highest_m:
             raise InputError(
                 f"the camera at height {self.position[2]:.1f} m is not above the surface, whose highest point "
                 f"is at {highest_m:.1f} m"
+            )
+        x, y = grid.corners()
+        away = float(np.hypot(x - self.position[0], y - self.position[1]).min())
+        if away > FARTHEST_OF_HEIGHT * (self.position[2] - highest_m) + float(np.hypot(np.ptp(x), np.ptp(y))):
+            raise InputError(
+                f"the camera at {place(self.position)} is {away / 1000:.0f} km from the nearest corner of the scene, "
+                f"far too low to see it; allowed is a position in the CRS of the image, or in that of crs = ..."
             )
 
     def describe(self, grid: Grid, block: Block, heights: Array) -> dict[str, str]:
