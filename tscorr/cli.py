@@ -122,7 +122,9 @@ def print_outcome(result: "BatchResult") -> None:
     print_table(rows)
     for note in notes:
         click.echo(note)
-    click.echo(f"results: {result.folder}")
+    here = Path.cwd()
+    folder = result.folder.relative_to(here) if result.folder.is_relative_to(here) else result.folder
+    click.echo(f"results: {folder}")
 
 
 def percent(share: float | None) -> str:

@@ -38,9 +38,9 @@ def residual_glare(scene: Scene, corrected: Path) -> dict[str, float | None] | N
             seen = stored * scale + offset
             specular = seen - wanted
             valid &= (specular > LEAST_SHARE * seen).any(axis=0)
-            corrected = result.read(block)
-            valid &= (corrected != scene.stored.nodata).all(axis=0)  # uncorrectable = "nodata" claims nothing
-            left = corrected * scale + offset - wanted
+            kept = result.read(block)
+            valid &= (kept != scene.stored.nodata).all(axis=0)  # uncorrectable = "nodata" claims nothing
+            left = kept * scale + offset - wanted
             before += float((specular[:, valid] ** 2).sum())
             after += float((left[:, valid] ** 2).sum())
             count += int(valid.sum())
