@@ -4,6 +4,7 @@ Rays lie on the map and cross the lines; what each carries from line to line is 
 """
 
 import math
+from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
@@ -58,19 +59,19 @@ def axes_away(shape: tuple[int, int], away: tuple[float, float], cell_x_m: float
     return Axes(rows, cols, cell_y_m, cell_x_m, transposed=False, backwards=north > 0)
 
 
-class Leg:
+class Leg(ABC):
     """One pass of a sweep; lines before `first` have no pixel to judge."""
 
     axes: Axes
     first: int
 
+    @abstractmethod
     def span(self, line: int) -> tuple[int, int]:
         """First and last + 1 of the pixels that the lines up to `line` need."""
-        raise NotImplementedError
 
+    @abstractmethod
     def judge(self, heights: Heights, visible: Mask, first: int, low: int, tolerance_m: float) -> None:
         """Write what is visible of the pixels from line `first` and pixel `low` on."""
-        raise NotImplementedError
 
 
 class ParallelLeg(Leg):
