@@ -22,6 +22,7 @@ from tscorr.width import (
     crossover_incidence,
     cutoff_tilt,
     f_spec_bound,
+    flank_slope,
     heading_table,
     lobe_shape,
     lobe_shapes,
@@ -462,6 +463,23 @@ def test_critical_roof_mirrors_the_sun_into_the_camera():
     np.testing.assert_allclose(2 * (normal @ sun) * normal - sun, view, atol=1e-12)
     straight = critical_roof(unit(40, 180), unit(0, 0))  # the camera overhead: half of the sun's zenith
     assert (float(straight.slope_deg), float(straight.aspect_deg)) == pytest.approx((20, 180))
+
+
+@pytest.mark.parametrize("name", PEAKED)
+def test_flank_slope_is_the_change_when_roof_or_view_is_turned_by_a_degree(name):
+    """Log of the exponential at half of its peak, by small turns in the principal plane."""
+    shape, small = lobe_shape(material(name)), 1e-4
+    zenith = 2 * math.sqrt(math.log(2)) / shape.w  # of the view; the sun is overhead, the tilt is half of it
+
+    def log_exponential(tilt_of_roof, turn_of_view):
+        vectors = unit(0, 0), unit(zenith + turn_of_view, 70), unit(tilt_of_roof, 70)
+        alpha = reference.geometry(*(vector.reshape(3, 1) for vector in vectors))[3]
+        return float(np.log(reference.facet_distribution(alpha, np.asarray(shape.w)))[0])
+
+    of_roof = (log_exponential(small, 0) - log_exponential(-small, 0)) / (2 * small)
+    of_view = (log_exponential(0, small) - log_exponential(0, -small)) / (2 * small)
+    assert of_roof == pytest.approx(flank_slope(shape), rel=1e-6)
+    assert of_view == pytest.approx(-flank_slope(shape) / 2, rel=1e-6)
 
 
 SHARES = {  # by the angle between scan line and solar principal plane, from an independent program

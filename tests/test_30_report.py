@@ -150,7 +150,7 @@ PROMISED_OF_A_MATERIAL = {
     "": {
         "pixels", "corrected", "uncorrectable", "incidence_deg", "facet_tilt_deg", "specular_share",
         "removed_mean", "azimuthal_width_deg", "azimuthal_arc_deg", "zenithal_width_deg", "width_at",
-        "crossover_incidence_deg", "alpha_cut_deg", "critical_roof",
+        "crossover_incidence_deg", "alpha_cut_deg", "critical_roof", "sensitivity",
     },
     "facet_tilt_deg": {"min", "p05", "p50"},
     "specular_share": {"p50", "p95", "max"},

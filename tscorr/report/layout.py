@@ -203,6 +203,11 @@ def _sentences(report: Report, name: str) -> str:
             f"azimuth, typically {degrees(width['p50'])}"
             + (f"; on {percent(none)} of them it has no half maximum." if none >= 0.005 else ".")
         )
+    slope = material["sensitivity"]["per_degree_of_normal"]
+    text += (
+        f" Where it is half as strong as at its peak, a degree of error in the roof’s slope changes it by "
+        f"{percent(slope)}, one in the direction of the view by {percent(slope / 2)}."
+    )
     if minutes is not None:
         text += f" On level ground the sun turns by half of its width in {minutes:.0f} minutes."
     return text

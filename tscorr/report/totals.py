@@ -19,6 +19,7 @@ from tscorr.width import (
     critical_roof,
     crossover_incidence,
     cutoff_tilt,
+    flank_slope,
     heading_table,
     lobe_shapes,
     width_rows,
@@ -143,6 +144,7 @@ def _material(facts: SceneFacts, row: int, path: Array | None) -> dict[str, Any]
         "width_at": width_rows(lobe, form=rules.form),
         "crossover_incidence_deg": crossover_incidence(lobe, rules.form),
         "alpha_cut_deg": _alpha_cut(facts, row),
+        "sensitivity": _sensitivity(lobe),
         "critical_roof": _critical_roof(facts),
         "level_width_deg": level_width_deg,
         "half_width_minutes": _minutes_to_turn(path, level_width_deg / 2),
@@ -192,6 +194,12 @@ def _falling_quantiles(width: Callable[[float], SupportsFloat], edge_deg: float,
         **{name: float(width(max(place, edge_deg))) for name, place in at.items()},
         "none_fraction": 1 - wide.sum() / total,
     }
+
+
+def _sensitivity(lobe: LobeShape) -> dict[str, float | None]:
+    """Relative change of the glare, where it is half of its peak, per degree of error in a direction."""
+    slope = flank_slope(lobe) if lobe.has_peak else None
+    return {"per_degree_of_normal": slope, "per_degree_of_view": None if slope is None else slope / 2}
 
 
 def _alpha_cut(facts: SceneFacts, row: int) -> float:

@@ -16,7 +16,7 @@ from tscorr.width.azimuthal import (
 )
 from tscorr.width.lobe import LobeShape, lobe_shape, lobe_shapes
 from tscorr.width.reach import cutoff_tilt, f_spec_bound
-from tscorr.width.summary import Roof, critical_roof, heading_table, width_rows
+from tscorr.width.summary import Roof, critical_roof, flank_slope, heading_table, width_rows
 from tscorr.width.zenithal import crossover_incidence, peak_exitance, zenithal_width
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "crossover_incidence",
     "cutoff_tilt",
     "f_spec_bound",
+    "flank_slope",
     "heading_table",
     "lobe_shape",
     "lobe_shapes",

@@ -50,6 +50,15 @@ def _rows(shape: LobeShape, incidences_deg: tuple[float, ...], form: str) -> lis
     return [{key: _or_none(values[row]) for key, values in columns.items()} for row in range(len(incidence))]
 
 
+def flank_slope(m: Material | LobeShape, *, wavelength_um: float | None = None) -> float:
+    """How fast the exponential falls where it is half of its peak: relative change per degree of facet tilt.
+
+    |d ln exp(-(w alpha)^2) / d alpha| = 2 w^2 alpha at alpha = sqrt(ln 2) / w. A surface normal that errs by a
+    degree in the principal plane changes the tilt by a degree; a direction of view or sun, by half of it.
+    """
+    return 2 * math.sqrt(math.log(2)) * lobe_shape(m, wavelength_um).w
+
+
 class Roof(NamedTuple):
     """Orientation of a plane: slope from the horizontal, and the azimuth it faces."""
 
