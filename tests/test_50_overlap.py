@@ -194,7 +194,7 @@ def test_overlaps_are_not_computed_again_where_nothing_changed(tmp_path, monkeyp
     batch.run(path)
     first = [(tmp_path / "out" / name).read_bytes() for name in ("batch.json", "index.html")]
     with monkeypatch.context() as patch:
-        patch.setattr(batch, "overlaps", lambda _: pytest.fail("computed again"))
+        patch.setattr(batch.overview, "overlaps", lambda _: pytest.fail("computed again"))
         batch.run(path)
     again = [(tmp_path / "out" / name).read_bytes() for name in ("batch.json", "index.html")]
     states = [json.loads(text)["overlaps"] for text in (first[0], again[0])]
@@ -220,7 +220,7 @@ def test_a_damaged_result_costs_the_comparison_and_nothing_else(tmp_path, monkey
     def fails(_):
         raise OSError("the disk is gone")
 
-    monkeypatch.setattr(batch, "overlaps", fails)
+    monkeypatch.setattr(batch.overview, "overlaps", fails)
     assert batch.run(path).exit_code == 0
     assert "the overlaps of the scenes could not be compared: the disk is gone" in caplog.text
     assert (tmp_path / "out" / "index.html").exists()

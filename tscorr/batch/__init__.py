@@ -1,0 +1,11 @@
+"""Many scenes: plan all, then correct one after the other; resume what is done, go on where one fails.
+
+`planning` checks all scenes before work starts, `local` corrects them on this machine, `overview` writes what stands
+at the top of the output folder, `runner` puts them together, and `outcome` is what comes back.
+"""
+
+from tscorr.batch.outcome import BatchResult, SceneOutcome, SceneProgress, silent_scene
+from tscorr.batch.planning import library_of, plan
+from tscorr.batch.runner import run
+
+__all__ = ["BatchResult", "SceneOutcome", "SceneProgress", "library_of", "plan", "run", "silent_scene"]

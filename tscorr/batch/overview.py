@@ -1,0 +1,82 @@
+"""What stands at the top of the output folder: batch.json, index.html and the STAC collection."""
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict
+
+from tscorr import __version__, config, stac
+from tscorr.batch.outcome import BatchResult
+from tscorr.errors import TscorrError
+from tscorr.report import Difference, Overlap, SceneLine, batch_page
+from tscorr.scene.correct import target_of
+from tscorr.scene.overlap import overlaps
+from tscorr.scene.plan import Scene
+
+log = logging.getLogger("tscorr")
+
+
+def write_overview(settings: config.Config, result: BatchResult, planned: Sequence[Scene]) -> None:
+    """batch.json, index.html and the STAC collection at the top of the output folder."""
+    rows = [
+        {"scene": scene.name, "state": scene.state, "folder": scene.folder.name, "error": scene.error}
+        for scene in result.scenes
+    ]
+    shared = _overlaps(result, planned)
+    batch = {
+        "title": settings.title,
+        "tscorr": __version__,
+        "scenes": rows,
+        "overlaps": [asdict(overlap) for overlap in shared],
+    }
+    page = batch_page(settings.title, _lines(settings, result), shared, __version__)
+    try:
+        result.folder.mkdir(parents=True, exist_ok=True)
+        (result.folder / "batch.json").write_text(json.dumps(batch, indent=1) + "\n", encoding="utf-8")
+        (result.folder / "index.html").write_text(page, encoding="utf-8")
+        items = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(result.folder.glob("*/item.json"))]
+        if items:
+            collected = stac.collection(title=settings.title or "tscorr", items=items)
+            (result.folder / "collection.json").write_text(json.dumps(collected, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        log.warning("the overview in %s could not be written: %s", result.folder, error)
+
+
+def _lines(settings: config.Config, result: BatchResult) -> list[SceneLine]:
+    """The scenes of this run, and those of the configuration that earlier runs have published."""
+    lines = [
+        SceneLine(scene.name, scene.state, scene.folder.name, scene.error, scene.report) for scene in result.scenes
+    ]
+    known = {scene.name for scene in result.scenes}
+    for name in (str(scene.name) for scene in settings.scenes):
+        report = result.folder / name / "report.json"
+        if name not in known and report.exists():
+            lines.append(SceneLine(name, "earlier", name, report=json.loads(report.read_text(encoding="utf-8"))))
+    return lines
+
+
+def _overlaps(result: BatchResult, planned: Sequence[Scene]) -> list[Overlap]:
+    """The differences of scenes that share ground; those of the last run where it had the same results."""
+    states = {scene.name: scene.state for scene in result.scenes}
+    if set(states.values()) == {"current"} and (known := _known_overlaps(result)) is not None:
+        return known
+    try:
+        return overlaps([(scene, target_of(scene)) for scene in planned if states[scene.name] != "failed"])
+    except (TscorrError, OSError) as error:
+        log.warning("the overlaps of the scenes could not be compared: %s", error)
+        return []
+
+
+def _known_overlaps(result: BatchResult) -> list[Overlap] | None:
+    """The overlaps in batch.json if it is of the same scenes, none of which failed."""
+    try:
+        batch = json.loads((result.folder / "batch.json").read_text(encoding="utf-8"))
+        same = [row["scene"] for row in batch["scenes"]] == [scene.name for scene in result.scenes]
+        if not same or any(row["state"] == "failed" for row in batch["scenes"]):
+            return None
+        return [
+            Overlap(row["first"], row["second"], {name: Difference(*d) for name, d in row["materials"].items()})
+            for row in batch["overlaps"]
+        ]
+    except (OSError, ValueError, KeyError, TypeError):  # missing, or of another version
+        return None

@@ -1,0 +1,62 @@
+"""A batch from its configuration to the overview: plan all, correct what is not current, go on where one fails."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from tscorr import config
+from tscorr.batch.local import outcomes
+from tscorr.batch.outcome import BatchResult, SceneProgress, silent_scene
+from tscorr.batch.overview import write_overview
+from tscorr.batch.planning import plan
+
+log = logging.getLogger("tscorr")
+
+
+def run(
+    settings: config.Config | str | Path,
+    *,
+    scenes: Sequence[str] = (),
+    materials: Sequence[str] = (),
+    workers: int | None = None,
+    overwrite: bool = False,
+    progress: SceneProgress = silent_scene,
+) -> BatchResult:
+    """Correct the scenes of a configuration.
+
+    settings  : a configuration, or the path of one.
+    overwrite : recompute scenes whose published result is current.
+    Raises ConfigError, MaterialError or InputError before any work starts; later errors fail their scene.
+    """
+    if not isinstance(settings, config.Config):
+        settings = config.load_config(settings)
+    if workers is not None:
+        settings = settings.model_copy(update={"run": settings.run.model_copy(update={"workers": workers})})
+    planned = plan(settings, scenes, materials)
+    folder = Path(settings.output.directory)
+    with _log_file(folder):
+        result = BatchResult(folder, tuple(outcomes(planned, overwrite, progress)))
+    write_overview(settings, result, planned)
+    return result
+
+
+@contextmanager
+def _log_file(folder: Path) -> Iterator[None]:
+    """Everything that is logged goes to batch.log too, behind what earlier runs wrote; where it can be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handler = logging.FileHandler(folder / "batch.log", encoding="utf-8")
+    except OSError:
+        yield  # the scenes will say that the folder cannot be written
+        return
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    level = log.level
+    log.setLevel(logging.INFO)
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+        handler.close()
