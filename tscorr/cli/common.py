@@ -1,0 +1,75 @@
+"""What the commands share: one way to fail, arguments that several take, tables on the terminal."""
+
+import functools
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tscorr.errors import ConfigError, TscorrError
+
+BAD_USAGE, INTERRUPTED = 2, 130
+
+
+def with_clear_errors(command: Callable[..., Any]) -> Callable[..., Any]:
+    """A command whose errors are one message on stderr and an exit code."""
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        console = logging.StreamHandler(sys.stderr)
+        console.setLevel(logging.WARNING)
+        logging.basicConfig(format="tscorr: %(message)s", handlers=[console])
+        try:
+            return command(*args, **kwargs)
+        except TscorrError as error:
+            for line in str(error).splitlines():
+                click.echo(f"tscorr: {line}", err=True)
+            sys.exit(BAD_USAGE)
+        except KeyboardInterrupt:
+            click.echo("tscorr: interrupted; what was finished stays, the rest is done by the next run", err=True)
+            sys.exit(INTERRUPTED)
+
+    return wrapped
+
+
+config_argument = click.argument("config", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+form_option = click.option(
+    "--form", type=click.Choice(["full", "simplified"]), default="full", help="simplified: without the factor G."
+)
+library_option = click.option(
+    "--library",
+    "libraries",
+    multiple=True,
+    metavar="FILE",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Another material file.",
+)
+
+
+def percent(share: float | None) -> str:
+    """A share as text."""
+    if share is None:
+        return "-"
+    return f"{100 * share:.1f} %"
+
+
+def print_table(rows: Sequence[Sequence[str]], left: int = 2) -> None:
+    """Columns side by side, the first `left` to the left, numbers to the right."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for row in rows:
+        cells = [
+            cell.ljust(width) if i < left else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        click.echo("  ".join(cells).rstrip())
+
+
+def number(option: str, text: str, allowed: str) -> float:
+    """The number that an option was given as text."""
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigError(f"{option} = {text!r}; allowed is {allowed}") from None
