@@ -14,12 +14,10 @@ from rasterio.warp import transform_bounds
 
 from tscorr.errors import InputError
 from tscorr.grid import Grid
+from tscorr.rasters.sound import check_sound, open_dataset
 
-DRIVERS = ["GTiff", "ENVI", "HFA", "JP2OpenJPEG", "PNG", "JPEG", "AAIGrid", "EHdr"]
-"""formats that are opened; a VRT from an unknown hand may name any file of the machine"""
-LARGEST_TILE_BYTES = 256e6
 IMAGE_TYPES = ("uint8", "int16", "uint16", "float32")
-ENVIRONMENT = {"GDAL_CACHEMAX": 64, "GDAL_NUM_THREADS": "1"}
+ENVIRONMENT = {"GDAL_CACHEMAX": 64, "GDAL_NUM_THREADS": "1", "GDAL_VRT_ENABLE_PYTHON": "NO"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +42,8 @@ class RasterInfo:
     band_tags: tuple[dict[str, dict[str, str]], ...]
     """for each band, tags by domain ('' and 'IMAGERY')"""
     colors: tuple[ColorInterp, ...] = ()
+    files: tuple[Path, ...] = ()
+    """the raster, and what GDAL reads beside it: header, overviews, mask, world file"""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -55,10 +55,7 @@ class RasterInfo:
 def opened(path: Path) -> Iterator[Any]:
     """A dataset open for reading; InputError names the file where GDAL cannot."""
     try:
-        with rasterio.Env(**ENVIRONMENT), rasterio.open(path, sharing=False) as dataset:
-            if dataset.driver not in DRIVERS:
-                allowed = ", ".join(DRIVERS)
-                raise InputError(f"{path} is in the format {dataset.driver}; allowed are {allowed}")
+        with rasterio.Env(**ENVIRONMENT), open_dataset(path) as dataset:
             yield dataset
     except RasterioError as error:
         raise InputError(f"{path} cannot be read: {reason_of(error, path)}") from None
@@ -67,24 +64,17 @@ def opened(path: Path) -> Iterator[Any]:
 def describe(path: str | Path) -> RasterInfo:
     """The header of a raster, checked before a pixel is read.
 
-    Raises InputError where the file is missing, is no raster, or declares tiles that no honest file has.
+    Raises InputError where the file is missing, is no raster, or declares what no honest file does.
     """
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path} does not exist")
+    if not path.is_file():
+        raise InputError(f"{path} is no file; allowed is a raster")
     with opened(path) as dataset:
-        dtypes = set(dataset.dtypes)
-        if dataset.count < 1 or len(dtypes) != 1:
-            raise InputError(f"{path} has bands of the types {sorted(dtypes)}; allowed is one type")
-        dtype = np.dtype(dtypes.pop())
+        check_sound(dataset, path)
+        dtype = np.dtype(dataset.dtypes[0])
         rows, cols = dataset.block_shapes[0]
-        at_once = rows * cols * dtype.itemsize
-        at_once *= dataset.count if dataset.interleaving == Interleaving.pixel else 1
-        if at_once > LARGEST_TILE_BYTES:
-            raise InputError(
-                f"{path} is stored in tiles of {rows} x {cols} pixels, {at_once / 1e6:.0f} MB each; "
-                f"allowed are {LARGEST_TILE_BYTES / 1e6:.0f} MB"
-            )
         wavelengths, widths = _wavelengths(dataset)
         return RasterInfo(
             path=path,
@@ -102,6 +92,7 @@ def describe(path: str | Path) -> RasterInfo:
             tags=dataset.tags(),
             band_tags=tuple({ns: dataset.tags(i, ns=ns) for ns in ("", "IMAGERY")} for i in dataset.indexes),
             colors=tuple(dataset.colorinterp),
+            files=(path, *(Path(file) for file in dataset.files[1:])),
         )
 
 

@@ -14,6 +14,7 @@ from rasterio.vrt import WarpedVRT
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
 from tscorr.rasters.header import ENVIRONMENT, RasterInfo, opened, reason_of
+from tscorr.rasters.sound import open_dataset
 
 Array = NDArray[Any]
 
@@ -90,7 +91,7 @@ class Reader:
         """The handle of the calling thread."""
         if not hasattr(self._local, "dataset"):
             with rasterio.Env(**ENVIRONMENT):
-                source = rasterio.open(self.info.path, sharing=False)
+                source = open_dataset(self.info.path)
                 dataset = source if self._aligned else self._warped(source)
             with self._lock:
                 self._handles += [dataset] if dataset is source else [dataset, source]

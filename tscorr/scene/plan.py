@@ -63,9 +63,10 @@ class Scene:
     @property
     def inputs(self) -> list[Path]:
         """Every file that the result depends on."""
-        files = [self.image.path, self.class_map.path, *(info.path for info in self.surface_files)]
+        infos = [self.image, self.class_map, *self.surface_files]
         if self.confidence is not None:
-            files.append(self.confidence.path)
+            infos.append(self.confidence)
+        files = [file for info in infos for file in info.files]
         if self.settings.truth is not None:
             files += [Path(self.settings.truth.diffuse), Path(self.settings.truth.sunlit)]
         return [*files, *self.seen.files, *map(Path, self.config.materials.library)]
@@ -208,8 +209,13 @@ def _per_band(value: float | Sequence[float], image: rasters.RasterInfo, what: s
 def _stored(settings: config.Scene, image: rasters.RasterInfo) -> Stored:
     scale = image.scales if settings.scale is None else _per_band(settings.scale, image, "scale")
     offset = image.offsets if settings.offset is None else _per_band(settings.offset, image, "offset")
-    if any(value == 0 for value in scale):
-        raise InputError(f"the image {image.path} has the scale 0; allowed is any other: give scale = ...")
+    for name, values in (("scale", scale), ("offset", offset)):
+        for value in values:
+            if not np.isfinite(value) or (name == "scale" and value == 0):
+                allowed = "any number but 0" if name == "scale" else "any number"
+                raise InputError(
+                    f"the image {image.path} has the {name} {value:g}; allowed is {allowed}: give {name} = ..."
+                )
     to_factor = np.pi if settings.quantity == "brdf" else 1.0
     if settings.nodata is not None and not rasters.can_hold(image.dtype, settings.nodata):
         raise ConfigError(f"nodata = {settings.nodata:g}, which no {image.dtype} pixel of {image.path} can be")
