@@ -7,9 +7,11 @@ configuration, 3 all failed, 130 interrupted. Heavy modules are imported inside 
 import click
 
 from tscorr import __version__
-from tscorr.cli import model, scenes, surfaces
+from tscorr.cli import model, scenes, start, surfaces
 
 COMMANDS = (
+    start.init,
+    start.quicklook,
     scenes.run,
     scenes.plan,
     scenes.explain,

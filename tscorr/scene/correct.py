@@ -3,7 +3,7 @@
 import resource
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from tscorr import __version__, publish, rasters, stac
 from tscorr.angles import relative_azimuth, true_azimuth, zenith_azimuth
 from tscorr.grid import Block, Grid, longitude_latitude
 from tscorr.report import SceneFacts, page, summary, write_json
+from tscorr.scene.pictures import PICTURE_PX, draw_quicklook
 from tscorr.scene.plan import Scene
 from tscorr.scene.run import Pipeline, Progress, silent
 from tscorr.scene.truth import residual_glare
@@ -27,7 +28,6 @@ Array = NDArray[Any]
 VIEW_SAMPLES = 48
 """the report samples the view directions on a grid of at most this many points a side"""
 RASTER_SAMPLES = 20
-PICTURE_PX = 768
 
 
 def settings_of(scene: Scene) -> dict[str, Any]:
@@ -150,33 +150,6 @@ def _sun_later(scene: Scene) -> Any:
         return None
     longitude, latitude = map(float, longitude_latitude(scene.grid, *scene.grid.center))
     return lambda minutes: solar_path(start, minutes, latitude, longitude)
-
-
-def draw_quicklook(scene: Scene, folder: Path) -> Path:
-    """The picture of before, after and flags, of a scene that is being published."""
-    from tscorr.quicklook import before_after, linear_rgb, rendering_note, rgb_matrix, used_bands
-
-    image = scene.image
-    wavelengths = scene.wavelengths_um or (float("nan"),) * image.bands
-    matrix = rgb_matrix(wavelengths, image.fwhm_um)
-    used = used_bands(matrix)
-    corrected = folder / "corrected.tif"
-    result = rasters.describe(corrected) if corrected.exists() else image
-    before, after = (linear_rgb(_bands(scene, info, used), matrix[used]) for info in (image, result))
-    path = folder / "quicklook.png"
-    flag_file = folder / "flags.tif"
-    flags = np.zeros(before.shape[:2], np.uint16)
-    if flag_file.exists():
-        flags = rasters.read_decimated_flags(rasters.describe(flag_file), PICTURE_PX)
-    before_after(before, after, flags, path, title=scene.name, note=rendering_note(wavelengths, matrix))
-    return path
-
-
-def _bands(scene: Scene, info: rasters.RasterInfo, bands: Iterable[int]) -> Iterator[Array]:
-    """Reflectance factor of some bands, decimated, one after the other."""
-    for band in bands:
-        stored = rasters.read_decimated(info, PICTURE_PX, [band + 1])[0]
-        yield stored * scene.stored.scale[band] + scene.stored.offset[band]
 
 
 def stac_item(scene: Scene, folder: Path, facts: SceneFacts, report: Mapping[str, Any]) -> dict[str, Any]:

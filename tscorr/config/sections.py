@@ -1,9 +1,5 @@
-"""The configuration: a TOML file as pydantic models, checked before any work starts."""
+"""The tables of a configuration file as pydantic models."""
 
-import os
-import tomllib
-from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -18,7 +14,7 @@ from pydantic import (
     model_validator,
 )
 
-from tscorr.errors import ConfigError, nearest
+from tscorr.errors import nearest
 
 Product = Literal["corrected", "flags", "removed", "azimuthal_width", "angles"]
 
@@ -120,9 +116,11 @@ class Materials(Section):
 class Sun(Section):
     """`sun`: a time, or a direction."""
 
-    time: AwareDatetime | None = None
-    zenith_deg: Annotated[float, Field(ge=0, lt=90)] | None = None
-    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    time: AwareDatetime | None = Field(None, description="with its zone, like 2026-06-21T10:12:00Z")
+    zenith_deg: Annotated[float, Field(ge=0, lt=90)] | None = Field(None, description="from the vertical")
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = Field(
+        None, description="clockwise from true north, surface to sun"
+    )
 
     @model_validator(mode="after")
     def _one_of_two(self) -> "Sun":
@@ -133,31 +131,35 @@ class Sun(Section):
 
 
 class ConstantViewSettings(Section):
-    """`view` of kind constant."""
+    """`view` of kind constant: one direction for the whole image."""
 
     kind: Literal["constant"]
-    zenith_deg: Annotated[float, Field(ge=0, lt=90)]
-    azimuth_deg: Annotated[float, Field(ge=-360, le=360)]
+    zenith_deg: Annotated[float, Field(ge=0, lt=90)] = Field(description="from the vertical", examples=[10.0])
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
+        description="clockwise from true north, surface to sensor", examples=[90.0]
+    )
 
 
 class FrameViewSettings(Section):
-    """`view` of kind frame."""
+    """`view` of kind frame: one camera that took the whole image at once."""
 
     kind: Literal["frame"]
-    position: tuple[float, float, float]
-    crs: str | None = None
-    height_offset_m: float = 0.0
+    position: tuple[float, float, float] = Field(
+        description="x, y, z of the camera in the image's CRS, or in `crs` [m]", examples=[[84500.0, 447200.0, 600.0]]
+    )
+    crs: str | None = Field(None, description="of the positions; default: the image's")
+    height_offset_m: float = Field(0.0, description="added to the heights, which are ellipsoidal from GNSS")
 
 
 class LineViewSettings(Section):
-    """`view` of kind line."""
+    """`view` of kind line: a scanner that took row after row."""
 
     kind: Literal["line"]
-    trajectory: str = Field(description="CSV: utc,x,y,z[,roll_deg,pitch_deg,heading_deg]")
+    trajectory: str = Field(description="CSV: utc,x,y,z[,roll_deg,pitch_deg,heading_deg]", examples=["trajectory.csv"])
     start: AwareDatetime | None = Field(None, description="first time of the line, where the file holds more")
     end: AwareDatetime | None = None
-    crs: str | None = None
-    height_offset_m: float = 0.0
+    crs: str | None = Field(None, description="of the positions; default: the image's")
+    height_offset_m: float = Field(0.0, description="added to the heights, which are ellipsoidal from GNSS")
 
     @model_validator(mode="after")
     def _start_before_end(self) -> "LineViewSettings":
@@ -167,11 +169,13 @@ class LineViewSettings(Section):
 
 
 class AnglesViewSettings(Section):
-    """`view` of kind angles."""
+    """`view` of kind angles: rasters of zenith angle and azimuth."""
 
     kind: Literal["angles"]
-    zenith: str = Field(description="raster of the view zenith angle [degrees]")
-    azimuth: str = Field(description="raster of the azimuth from true north, surface to sensor [degrees]")
+    zenith: str = Field(description="raster of the view zenith angle [degrees]", examples=["vza.tif"])
+    azimuth: str = Field(
+        description="raster of the azimuth from true north, surface to sensor [degrees]", examples=["vaa.tif"]
+    )
     scale: Annotated[float, Field(gt=0)] | None = Field(
         None, description="stored value times this is degrees; default: the scale and offset of the file"
     )
@@ -181,17 +185,19 @@ class ObsViewSettings(Section):
     """`view` of kind obs: an observation geometry file of JPL, EMIT or NEON; with no `sun`, the sun is its own."""
 
     kind: Literal["obs"]
-    path: str
+    path: str = Field(description="the observation geometry file", examples=["flight_obs"])
 
 
 class MosaicViewSettings(Section):
-    """`view` of kind mosaic."""
+    """`view` of kind mosaic: which camera each pixel came from."""
 
     kind: Literal["mosaic"]
-    index: str = Field(description="raster of the number of the camera that each pixel came from")
-    cameras: str = Field(description="CSV: id,x,y,z")
-    crs: str | None = None
-    height_offset_m: float = 0.0
+    index: str = Field(
+        description="raster of the number of the camera that each pixel came from", examples=["source.tif"]
+    )
+    cameras: str = Field(description="CSV: id,x,y,z", examples=["cameras.csv"])
+    crs: str | None = Field(None, description="of the positions; default: the image's")
+    height_offset_m: float = Field(0.0, description="added to the heights, which are ellipsoidal from GNSS")
 
 
 ViewSettings = Annotated[
@@ -206,33 +212,33 @@ ViewSettings = Annotated[
 
 
 class FlatSettings(Section):
-    """`surface` of kind flat."""
+    """`surface` of kind flat: everything is horizontal."""
 
     kind: Literal["flat"]
-    height_m: float = 0.0
+    height_m: float = Field(0.0, description="of the ground", examples=[0.0])
 
 
 class DsmSettings(Section):
-    """`surface` of kind dsm or roof_planes."""
+    """`surface` of kind dsm, or roof_planes: a surface model as it is, or smoothed to planes of roofs."""
 
     kind: Literal["dsm", "roof_planes"]
-    path: str
+    path: str = Field(description="raster of heights, in a projected CRS [m]", examples=["dsm.tif"])
 
 
 class NormalsSettings(Section):
-    """`surface` of kind normals."""
+    """`surface` of kind normals: unit vectors that are known already."""
 
     kind: Literal["normals"]
-    path: str
-    heights: str | None = None
+    path: str = Field(description="raster of three bands: east, north, up", examples=["normals.tif"])
+    heights: str | None = Field(None, description="raster of heights, for shadows [m]")
 
 
 class ObsSurfaceSettings(Section):
     """`surface` of kind obs: slope and aspect of an observation geometry file."""
 
     kind: Literal["obs"]
-    path: str
-    heights: str | None = None
+    path: str = Field(description="the observation geometry file", examples=["flight_obs"])
+    heights: str | None = Field(None, description="raster of heights, for shadows [m]")
 
 
 SurfaceSettings = Annotated[
@@ -251,20 +257,24 @@ class Scene(Section):
     """[[scenes]]: one image, or a glob of images that share their settings."""
 
     name: str | None = Field(None, description="default: the image's stem")
-    image: str
-    quantity: Literal["reflectance_factor", "brdf"] = "reflectance_factor"
-    scale: PerBand | None = None
-    offset: PerBand | None = None
-    nodata: float | None = None
-    wavelength_um: list[float] | None = None
+    image: str = Field(description="path, or a glob: {stem} and {parent} then serve in the other paths")
+    quantity: Literal["reflectance_factor", "brdf"] = Field(
+        "reflectance_factor", description="what scale * stored + offset is"
+    )
+    scale: PerBand | None = Field(None, description="default: the file's; one value or one a band")
+    offset: PerBand | None = Field(None, description="default: the file's; one value or one a band")
+    nodata: float | None = Field(None, description="stored value; default: the file's")
+    wavelength_um: list[float] | None = Field(None, description="centre of each band; default: the file's")
     saturation: PerBand | None = Field(None, description="stored value from which a band is saturated")
-    direct_fraction: PerBand | None = None
-    class_map: str
-    class_confidence: str | None = None
-    sun: Sun | None = None
-    view: ViewSettings
-    surface: SurfaceSettings = FlatSettings(kind="flat")
-    shadows: bool = True
+    direct_fraction: PerBand | None = Field(None, description="as in [correction], for this scene")
+    class_map: str = Field(description="raster of classes, on any grid that overlaps the image")
+    class_confidence: str | None = Field(None, description="raster of how sure the class is, 0 to 1")
+    sun: Sun | None = Field(
+        None, description="a time or a direction; left out where a trajectory or an OBS file tells it"
+    )
+    view: ViewSettings = Field(description="where the sensor was")
+    surface: SurfaceSettings = Field(FlatSettings(kind="flat"), description="how the ground and the roofs lie")
+    shadows: bool = Field(True, description="find what casts shadows, and remove nothing there")
     truth: Truth | None = Field(None, description="of a synthetic scene: the residual glare is reported")
 
     @field_validator("name")
@@ -278,7 +288,7 @@ class Scene(Section):
 class Config(Section):
     """The whole file; `folder` is where its relative paths start."""
 
-    title: str = ""
+    title: str = Field("", description="heads the page of the results")
     output: Output = Output()
     model: Model = Model()
     correction: Correction = Correction()
@@ -297,127 +307,6 @@ class Config(Section):
         return self
 
 
-def load_config(path: str | Path) -> Config:
-    """The configuration of a TOML file, with every path made absolute and globs of images expanded.
-
-    Raises ConfigError listing every problem, each with its place in the file, its value and what is allowed.
-    """
-    path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the configuration {path} cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path} is not a TOML file: {error}") from None
-    try:
-        config = Config.model_validate(data)
-    except ValidationError as error:
-        raise ConfigError("\n".join(_problem(path, item) for item in error.errors())) from None
-    folder = path.resolve().parent
-    scenes = [scene for entry in config.scenes for scene in _expanded(entry, folder, path)]
-    _require_distinct([scene.name or "" for scene in scenes], path)
-    return config.model_copy(
-        update={
-            "scenes": scenes,
-            "output": config.output.model_copy(update={"directory": str(absolute(folder, config.output.directory))}),
-            "materials": config.materials.model_copy(
-                update={"library": [str(absolute(folder, library)) for library in config.materials.library]}
-            ),
-        }
-    )
-
-
-def _expanded(scene: Scene, folder: Path, config: Path) -> Iterator[Scene]:
-    """The scene of each image that a glob matches, with {stem} and {parent} filled in and absolute paths."""
-    pattern = Path(scene.image)
-    if any(c in scene.image for c in "*?["):
-        anchor = Path(pattern.anchor) if pattern.is_absolute() else folder
-        images = sorted(anchor.glob(str(pattern.relative_to(pattern.anchor))))
-        if not images:
-            raise ConfigError(f"{config}: no image matches {scene.image}")
-        if scene.name is not None and len(images) > 1:
-            raise ConfigError(f"{config}: the name '{scene.name}' cannot serve {len(images)} images; leave it out")
-    else:
-        images = [absolute(folder, scene.image)]
-    for image in images:
-        words = {"stem": image.stem, "parent": str(image.parent)}
-        filled = _with_paths(scene.model_dump(), folder, words)
-        try:
-            yield Scene.model_validate({**filled, "image": str(image), "name": scene.name or image.stem})
-        except ValidationError as error:
-            raise ConfigError("\n".join(_problem(config, item) for item in error.errors())) from None
-
-
-def absolute(folder: Path, path: str) -> Path:
-    """A path of the file, which is relative to the file's folder, without `..` in it."""
-    return Path(os.path.normpath(folder / path))
-
-
-PATHS = {
-    "class_map",
-    "class_confidence",
-    "path",
-    "heights",
-    "trajectory",
-    "zenith",
-    "azimuth",
-    "index",
-    "cameras",
-    "diffuse",
-    "sunlit",
-}
-
-
-def _with_paths(value: Any, folder: Path, words: Mapping[str, str], key: str = "") -> Any:
-    if isinstance(value, dict):
-        return {name: _with_paths(item, folder, words, name) for name, item in value.items()}
-    if key in PATHS and isinstance(value, str):
-        for word, text in words.items():
-            value = value.replace("{" + word + "}", text)
-        return str(absolute(folder, value))
-    return value
-
-
-def _require_distinct(names: list[str], config: Path) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(f"{config}: two scenes are called '{name}'; give them a name each")
-
-
-def _problem(path: Path, item: Mapping[str, Any]) -> str:
-    """One line for one problem that pydantic found."""
-    location = [part for i, part in enumerate(item["loc"]) if not _is_kind(item["loc"], i)]
-    where = ".".join(str(part) for part in location) or "file"
-    if item["type"] == "extra_forbidden":
-        *place, key = location
-        known = _known_keys(item["loc"])
-        table = ".".join(map(str, place)) or "the top level"
-        return f"{path}: unknown key '{key}' in {table}{nearest(str(key), known)}"
-    message = item["msg"].removeprefix("Value error, ")
-    if item["type"] == "union_tag_invalid":
-        kinds = SURFACES if location[-1] == "surface" else VIEWS
-        kind = str(item["input"].get("kind"))
-        return f"{path}: {where}.kind = '{kind}'; allowed are {', '.join(kinds)}{nearest(kind, kinds)}"
-    if item["type"] == "missing":
-        return f"{path}: {where} is missing"
-    if where == "file":
-        return f"{path}: {message}"
-    return f"{path}: {where} = {item['input']!r}: {message[0].lower()}{message[1:]}"
-
-
-def _is_kind(location: tuple[Any, ...], i: int) -> bool:
-    """Whether a part of a location is the kind of a view or surface, which is no key of the file."""
-    return i > 0 and location[i - 1] in {"view", "surface"} and location[i] in {**VIEWS, **SURFACES}
-
-
-def _known_keys(location: tuple[Any, ...]) -> list[str]:
-    """Keys that are known where an unknown one was found."""
-    model: Any = Config
-    for part in location[:-1]:
-        model = _inside(model, part)
-    return list(getattr(model, "model_fields", {}))
-
-
 VIEWS: dict[str, type[Section]] = {
     "constant": ConstantViewSettings,
     "frame": FrameViewSettings,
@@ -433,23 +322,17 @@ SURFACES: dict[str, type[Section]] = {
     "normals": NormalsSettings,
     "obs": ObsSurfaceSettings,
 }
-
-
-def _inside(model: Any, part: Any) -> Any:
-    """The model one step further down a location: a field, an item of a list, a kind of view or surface."""
-    if isinstance(model, dict):
-        return model.get(part)
-    sections: dict[str, Any] = {
-        "output": Output,
-        "model": Model,
-        "correction": Correction,
-        "run": Run,
-        "materials": Materials,
-        "scenes": Scene,
-        "sun": Sun,
-        "view": VIEWS,
-        "surface": SURFACES,
-        "truth": Truth,
-        "settings": MaterialSettings,
-    }
-    return sections.get(part, model) if isinstance(part, str) else model
+TABLES: dict[str, Any] = {
+    "output": Output,
+    "model": Model,
+    "correction": Correction,
+    "run": Run,
+    "materials": Materials,
+    "scenes": Scene,
+    "sun": Sun,
+    "view": VIEWS,
+    "surface": SURFACES,
+    "truth": Truth,
+    "settings": MaterialSettings,
+}
+"""what stands under a key, wherever that is in the file"""

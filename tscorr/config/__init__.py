@@ -1,0 +1,48 @@
+"""The configuration: a TOML file as pydantic models, checked before any work starts."""
+
+from tscorr.config.loading import absolute, load_config
+from tscorr.config.sections import (
+    AnglesViewSettings,
+    Config,
+    ConstantViewSettings,
+    Correction,
+    DsmSettings,
+    FlatSettings,
+    FrameViewSettings,
+    LineViewSettings,
+    MaterialSettings,
+    Model,
+    MosaicViewSettings,
+    NormalsSettings,
+    ObsSurfaceSettings,
+    ObsViewSettings,
+    Scene,
+    Sun,
+    Truth,
+)
+from tscorr.config.template import FILL_IN, json_schema, template
+
+__all__ = [
+    "FILL_IN",
+    "AnglesViewSettings",
+    "Config",
+    "ConstantViewSettings",
+    "Correction",
+    "DsmSettings",
+    "FlatSettings",
+    "FrameViewSettings",
+    "LineViewSettings",
+    "MaterialSettings",
+    "Model",
+    "MosaicViewSettings",
+    "NormalsSettings",
+    "ObsSurfaceSettings",
+    "ObsViewSettings",
+    "Scene",
+    "Sun",
+    "Truth",
+    "absolute",
+    "json_schema",
+    "load_config",
+    "template",
+]
