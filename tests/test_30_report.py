@@ -3,6 +3,7 @@
 import dataclasses
 import html
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -151,6 +152,7 @@ PROMISED_OF_A_MATERIAL = {
         "pixels", "corrected", "uncorrectable", "incidence_deg", "facet_tilt_deg", "specular_share",
         "removed_mean", "azimuthal_width_deg", "azimuthal_arc_deg", "zenithal_width_deg", "width_at",
         "crossover_incidence_deg", "alpha_cut_deg", "critical_roof", "sensitivity",
+        "level_spot_m",
     },
     "facet_tilt_deg": {"min", "p05", "p50"},
     "specular_share": {"p50", "p95", "max"},
@@ -425,3 +427,22 @@ def test_a_browser_shows_all_of_it(whole_page, tmp_path, width):
     assert found["letters"] == []
     assert found["images"] == [True, True]
     assert found["plots"] == 3 * 2 + 2
+
+
+def test_spot_of_a_camera_is_where_the_exponential_is_above_half(facts):
+    """Level ground 1000 m under a camera, the sun in the south; the report is of first order in the width."""
+    report = summary(dataclasses.replace(facts, camera_height_m=1000.0))
+    sun = angles.unit_vector(SUN[0], 180.0)[:, None]
+    mirror = np.full(2401, 1000 * math.tan(math.radians(SUN[0])))  # from there the camera is seen in the north
+    step = np.linspace(-600, 600, mirror.size)
+
+    def extent(east, north):
+        to_camera = np.stack([east, north, np.full_like(step, 1000)])
+        half = to_camera / np.linalg.norm(to_camera, axis=0) + sun
+        tilt = np.degrees(np.arctan2(np.hypot(half[0], half[1]), half[2]))
+        return np.ptp(step[np.exp(-((0.153 * tilt) ** 2)) > 0.5])
+
+    spot = report["materials"]["red_aluminum"]["level_spot_m"]
+    assert spot["along"] == pytest.approx(extent(0 * step, mirror + step), rel=0.15)
+    assert spot["across"] == pytest.approx(extent(step, mirror), rel=0.15)
+    assert summary(facts)["materials"]["red_aluminum"]["level_spot_m"] == {"across": None, "along": None}

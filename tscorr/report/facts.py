@@ -57,6 +57,8 @@ class SceneFacts:
     """samples of the scene's view directions about the vertical, of one shape, nan where not viewed"""
     centre_view_deg: tuple[float, float] | None
     """zenith and azimuth of the view direction at the scene's centre"""
+    camera_height_m: float | None = None
+    """of a frame camera above the ground; None for other sensors"""
 
     seconds: Mapping[str, float]
     """wall, read, geometry, kernel, write"""

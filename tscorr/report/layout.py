@@ -203,6 +203,12 @@ def _sentences(report: Report, name: str) -> str:
             f"azimuth, typically {degrees(width['p50'])}"
             + (f"; on {percent(none)} of them it has no half maximum." if none >= 0.005 else ".")
         )
+    spot = material["level_spot_m"]
+    if spot["across"] is not None:
+        text += (
+            f" Seen from this camera, its glare on level ground is a spot of {spot['along']:.0f} m along the plane of "
+            f"the sun and {spot['across']:.0f} m across."
+        )
     slope = material["sensitivity"]["per_degree_of_normal"]
     text += (
         f" Where it is half as strong as at its peak, a degree of error in the roof’s slope changes it by "

@@ -147,6 +147,7 @@ def _material(facts: SceneFacts, row: int, path: Array | None) -> dict[str, Any]
         "sensitivity": _sensitivity(lobe),
         "critical_roof": _critical_roof(facts),
         "level_width_deg": level_width_deg,
+        "level_spot_m": _spot(facts, level_width_deg, float(zenithal_width(lobe, facts.solar_zenith_deg, rules.form))),
         "half_width_minutes": _minutes_to_turn(path, level_width_deg / 2),
     }
 
@@ -193,6 +194,20 @@ def _falling_quantiles(width: Callable[[float], SupportsFloat], edge_deg: float,
     return {
         **{name: float(width(max(place, edge_deg))) for name, place in at.items()},
         "none_fraction": 1 - wide.sum() / total,
+    }
+
+
+def _spot(facts: SceneFacts, azimuthal_deg: float, zenithal_deg: float) -> dict[str, float | None]:
+    """Size of the half maximum on level ground around the mirror point of a frame camera. [m]
+
+    Across the plane of the sun H tan(theta) times the azimuthal width, along it H / cos^2(theta) times the zenithal.
+    """
+    height, theta = facts.camera_height_m, math.radians(facts.solar_zenith_deg)
+    if height is None or theta >= math.pi / 2:
+        return {"across": None, "along": None}
+    return {
+        "across": height * math.tan(theta) * math.radians(azimuthal_deg),
+        "along": height / math.cos(theta) ** 2 * math.radians(zenithal_deg),
     }
 
 

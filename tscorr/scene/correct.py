@@ -21,6 +21,7 @@ from tscorr.scene.pictures import PICTURE_PX, draw_quicklook
 from tscorr.scene.plan import Scene
 from tscorr.scene.run import Pipeline, Progress, silent
 from tscorr.scene.truth import residual_glare
+from tscorr.sensor import FrameView
 from tscorr.sun import solar_path
 
 Array = NDArray[Any]
@@ -106,6 +107,7 @@ def facts_of(scene: Scene, pipeline: Pipeline, wall_s: float) -> SceneFacts:
         view_azimuth_deg=azimuth,
         relative_azimuth_deg=relative_azimuth(azimuth, sun.azimuth_deg),
         centre_view_deg=centre if np.isfinite(centre).all() else None,
+        camera_height_m=scene.view.position[2] - scene.ground_level_m if isinstance(scene.view, FrameView) else None,
         seconds={"wall": wall_s, **sums.seconds},
         peak_rss_mb=peak_rss_mb(),
         version=__version__,
