@@ -177,3 +177,42 @@ def test_damage_is_found_by_hash(tmp_path):
         f"{target / 'a.txt'} has changed since it was published",
         f"{target / 'b.txt'} is missing",
     ]
+
+
+def test_what_killed_runs_left_is_cleared_up_and_nothing_else(tmp_path):
+    published(tmp_path / ".a.01234567.old", "old")  # killed between the two renames of a
+    published(tmp_path / ".a.89abcdef.part", "new")
+    published(tmp_path / "b", "new")
+    published(tmp_path / ".b.01234567.old", "old")  # killed before the old b was deleted
+    (tmp_path / ".c.01234567.old").mkdir()  # killed while it was being deleted
+    (tmp_path / ".index.html.01234567.part").write_text("<")
+    for name in (".git", ".d.0123.part", ".e.01234567.keep", ".tscorr.lock"):
+        (tmp_path / name).mkdir()
+    (tmp_path / ".f.01234567.part").symlink_to(tmp_path / ".git")
+    done = publish.recover(tmp_path)
+    assert len(done) == 6
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        ".d.0123.part",
+        ".e.01234567.keep",
+        ".git",
+        ".tscorr.lock",
+        "a",
+        "b",
+    ]
+    assert (tmp_path / "a" / "a.txt").read_text() == "old"
+    assert (tmp_path / "b" / "a.txt").read_text() == "new"
+    assert publish.damaged(tmp_path / "a") == []
+    assert publish.recover(tmp_path) == []
+
+
+def test_a_text_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    publish.write_whole(tmp_path / "page", "old")
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        publish.write_whole(tmp_path / "page", "new")
+    assert [path.name for path in tmp_path.iterdir()] == ["page"]
+    assert (tmp_path / "page").read_text() == "old"

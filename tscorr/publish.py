@@ -1,12 +1,14 @@
 """Publishing a result: an output folder is whole or absent.
 
 Work happens in a hidden sibling folder on the same file system; the manifest is written last, everything is
-flushed to disk, and one rename puts the folder in its place.
+flushed to disk, and one rename puts the folder in its place. A folder that stands there already is renamed first, to
+be hidden, and deleted last: where a run was killed between the two renames, `recover` puts it back.
 """
 
 import hashlib
 import json
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Iterable, Mapping
@@ -16,6 +18,47 @@ from typing import Any, Self
 from tscorr.errors import OutputError
 
 MANIFEST = "manifest.json"
+HIDDEN = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>part|old)")
+"""names of what is being made and of what is being replaced"""
+
+
+def hidden_name(target: Path, kind: str) -> Path:
+    """A hidden sibling of `target` that nobody has: of the kind "part" (being made) or "old" (being replaced)."""
+    return target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.{kind}")
+
+
+def recover(folder: Path) -> list[str]:
+    """Clear up after runs that were killed: put back what was being replaced, delete what was not finished.
+
+    Only for who holds the lock of the folder. Returns what was done, one sentence each.
+    """
+    done = []
+    for path in sorted(folder.iterdir()):
+        found = HIDDEN.fullmatch(path.name)
+        if found is None:
+            continue
+        target = folder / found["name"]
+        if found["kind"] == "old" and read_manifest(path) is not None and not target.exists():
+            path.rename(target)
+            done.append(f"{target} is put back: a killed run was about to replace it")
+        elif path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+            done.append(f"{path} of a killed run is deleted")
+        else:
+            path.unlink()
+            done.append(f"{path} of a killed run is deleted")
+    return done
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file that is never seen half written."""
+    part = hidden_name(path, "part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        _flush(part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 class Publication:
@@ -23,7 +66,7 @@ class Publication:
 
     def __init__(self, target: Path) -> None:
         self.target = target
-        self.folder = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+        self.folder = hidden_name(target, "part")
 
     def __enter__(self) -> Self:
         try:
@@ -50,7 +93,7 @@ class Publication:
             raise OutputError(f"{self.target} cannot be published: {error}") from None
 
     def _replace(self) -> None:
-        old = self.target.with_name(f".{self.target.name}.{uuid.uuid4().hex[:8]}.old")
+        old = hidden_name(self.target, "old")
         if self.target.exists():
             self.target.rename(old)
         self.folder.rename(self.target)

@@ -4,10 +4,12 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 from tscorr import __version__, config, stac
 from tscorr.batch.outcome import BatchResult
 from tscorr.errors import TscorrError
+from tscorr.publish import read_manifest, write_whole
 from tscorr.report import Difference, Overlap, SceneLine, batch_page
 from tscorr.scene.correct import target_of
 from tscorr.scene.overlap import overlaps
@@ -19,7 +21,13 @@ log = logging.getLogger("tscorr")
 def write_overview(settings: config.Config, result: BatchResult, planned: Sequence[Scene]) -> None:
     """batch.json, index.html and the STAC collection at the top of the output folder."""
     rows = [
-        {"scene": scene.name, "state": scene.state, "folder": scene.folder.name, "error": scene.error}
+        {
+            "scene": scene.name,
+            "state": scene.state,
+            "folder": scene.folder.name,
+            "error": scene.error,
+            "key": _key(scene.folder),
+        }
         for scene in result.scenes
     ]
     shared = _overlaps(result, planned)
@@ -31,15 +39,20 @@ def write_overview(settings: config.Config, result: BatchResult, planned: Sequen
     }
     page = batch_page(settings.title, _lines(settings, result), shared, __version__)
     try:
-        result.folder.mkdir(parents=True, exist_ok=True)
-        (result.folder / "batch.json").write_text(json.dumps(batch, indent=1) + "\n", encoding="utf-8")
-        (result.folder / "index.html").write_text(page, encoding="utf-8")
+        write_whole(result.folder / "batch.json", json.dumps(batch, indent=1) + "\n")
+        write_whole(result.folder / "index.html", page)
         items = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(result.folder.glob("*/item.json"))]
         if items:
             collected = stac.collection(title=settings.title or "tscorr", items=items)
-            (result.folder / "collection.json").write_text(json.dumps(collected, indent=1) + "\n", encoding="utf-8")
+            write_whole(result.folder / "collection.json", json.dumps(collected, indent=1) + "\n")
     except OSError as error:
         log.warning("the overview in %s could not be written: %s", result.folder, error)
+
+
+def _key(folder: Path) -> str | None:
+    """The key that a published result was made with; None where there is none."""
+    manifest = read_manifest(folder)
+    return None if manifest is None else manifest.get("key")
 
 
 def _lines(settings: config.Config, result: BatchResult) -> list[SceneLine]:
@@ -68,10 +81,11 @@ def _overlaps(result: BatchResult, planned: Sequence[Scene]) -> list[Overlap]:
 
 
 def _known_overlaps(result: BatchResult) -> list[Overlap] | None:
-    """The overlaps in batch.json if it is of the same scenes, none of which failed."""
+    """The overlaps in batch.json if it is of the same results, none of which failed."""
     try:
         batch = json.loads((result.folder / "batch.json").read_text(encoding="utf-8"))
-        same = [row["scene"] for row in batch["scenes"]] == [scene.name for scene in result.scenes]
+        results = [(scene.name, _key(scene.folder)) for scene in result.scenes]
+        same = [(row["scene"], row["key"]) for row in batch["scenes"]] == results
         if not same or any(row["state"] == "failed" for row in batch["scenes"]):
             return None
         return [

@@ -5,8 +5,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from tscorr import config
+from tscorr import config, publish
 from tscorr.batch.local import outcomes
+from tscorr.batch.lock import locked
 from tscorr.batch.outcome import BatchResult, SceneProgress, silent_scene
 from tscorr.batch.overview import write_overview
 from tscorr.batch.planning import plan
@@ -27,7 +28,8 @@ def run(
 
     settings  : a configuration, or the path of one.
     overwrite : recompute scenes whose published result is current.
-    Raises ConfigError, MaterialError or InputError before any work starts; later errors fail their scene.
+    Raises ConfigError, MaterialError or InputError before any work starts, OutputError where another batch is at work
+    in the folder; later errors fail their scene.
     """
     if not isinstance(settings, config.Config):
         settings = config.load_config(settings)
@@ -35,9 +37,11 @@ def run(
         settings = settings.model_copy(update={"run": settings.run.model_copy(update={"workers": workers})})
     planned = plan(settings, scenes, materials)
     folder = Path(settings.output.directory)
-    with _log_file(folder):
+    with locked(folder), _log_file(folder):
+        for deed in publish.recover(folder):
+            log.warning("%s", deed)
         result = BatchResult(folder, tuple(outcomes(planned, overwrite, progress)))
-    write_overview(settings, result, planned)
+        write_overview(settings, result, planned)
     return result
 
 
@@ -45,10 +49,10 @@ def run(
 def _log_file(folder: Path) -> Iterator[None]:
     """Everything that is logged goes to batch.log too, behind what earlier runs wrote; where it can be written."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         handler = logging.FileHandler(folder / "batch.log", encoding="utf-8")
-    except OSError:
-        yield  # the scenes will say that the folder cannot be written
+    except OSError as error:
+        log.warning("%s cannot be written: %s", folder / "batch.log", error.strerror)
+        yield
         return
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     level = log.level

@@ -1,7 +1,8 @@
 """The command line: parse, call, print, exit.
 
 Results go to stdout, progress and log to stderr. Exit codes: 0 all done, 1 some scenes failed, 2 bad usage or
-configuration, 3 all failed, 130 interrupted. Heavy modules are imported inside the commands that need them.
+configuration, 3 all failed, 130 interrupted, 143 terminated. Heavy modules are imported inside the commands that need
+them.
 """
 
 import click

@@ -2,8 +2,11 @@
 
 import functools
 import logging
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +14,30 @@ import click
 
 from tscorr.errors import ConfigError, TscorrError
 
-BAD_USAGE, INTERRUPTED = 2, 130
+BAD_USAGE = 2
+SIGNALLED = 128
+"""exit code of a stop by signal, less the number of the signal"""
+
+
+class Stopped(KeyboardInterrupt):
+    """SIGTERM: a polite kill, after which everything is cleared up as after Ctrl-C."""
+
+
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """SIGTERM raises `Stopped` meanwhile."""
+
+    def stop(*_: object) -> None:
+        raise Stopped
+
+    if threading.current_thread() is not threading.main_thread():  # which is the only one that hears signals
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def with_clear_errors(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -23,14 +49,17 @@ def with_clear_errors(command: Callable[..., Any]) -> Callable[..., Any]:
         console.setLevel(logging.WARNING)
         logging.basicConfig(format="tscorr: %(message)s", handlers=[console])
         try:
-            return command(*args, **kwargs)
+            with stoppable():
+                return command(*args, **kwargs)
         except TscorrError as error:
             for line in str(error).splitlines():
                 click.echo(f"tscorr: {line}", err=True)
             sys.exit(BAD_USAGE)
-        except KeyboardInterrupt:
-            click.echo("tscorr: interrupted; what was finished stays, the rest is done by the next run", err=True)
-            sys.exit(INTERRUPTED)
+        except KeyboardInterrupt as error:
+            number = signal.SIGTERM if isinstance(error, Stopped) else signal.SIGINT
+            what = "terminated" if number == signal.SIGTERM else "interrupted"
+            click.echo(f"tscorr: {what}; what was finished stays, the rest is done by the next run", err=True)
+            sys.exit(SIGNALLED + number)
 
     return wrapped
 
