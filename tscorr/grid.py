@@ -41,6 +41,10 @@ class Block:
         """The same rectangle as rasterio reads and writes it."""
         return Window(self.col, self.row, self.width, self.height)
 
+    def below(self, rows: int) -> "Block":
+        """The block so many rows further down."""
+        return Block(self.row + rows, self.col, self.height, self.width)
+
     def padded(self, margin: int) -> "Block":
         """The block with `margin` pixels more on every side; may reach beyond the grid."""
         return Block(self.row - margin, self.col - margin, self.height + 2 * margin, self.width + 2 * margin)

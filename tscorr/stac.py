@@ -46,6 +46,7 @@ RASTERS = {
 }
 """title and roles"""
 TIFF_TIME = "TIFFTAG_DATETIME"
+TIFF, VRT = "image/tiff; application=geotiff", "application/xml"
 DOCUMENTS = {
     "quicklook": ("quicklook.png", "image/png", "before, after and flags", "overview"),
     "report_json": ("report.json", "application/json", "report, for programs", "metadata"),
@@ -86,6 +87,7 @@ def item(
     report: Mapping[str, Any],
     version: str,
     quicklook: bool = True,
+    strips: Sequence[str] = (),
 ) -> Json:
     """The STAC item of one scene's folder.
 
@@ -95,6 +97,7 @@ def item(
     view_*    : for the whole scene, of surface -> sensor from the vertical and true north; nan if unknown.
     report    : content of report.json.
     quicklook : whether quicklook.png was drawn.
+    strips    : names of the files that hold the pixels of `files`, where those are VRTs.
 
     A scene across the 180th meridian is not cut there. OSError where the image has no time and is gone.
     """
@@ -108,6 +111,7 @@ def item(
         **_view(solar_zenith_deg, solar_azimuth_deg, view_zenith_deg, view_azimuth_deg),
     }
     assets = {key: _raster(key, info, bands, report) for key, info in files.items()}
+    assets |= {Path(name).stem: _asset(name, TIFF, f"strip of {name.split('.')[0]}", "data") for name in strips}
     assets |= {key: _asset(*entry) for key, entry in DOCUMENTS.items() if quicklook or key != "quicklook"}
     folder = next((info.path.parent for info in files.values()), None)
     prefixes = {key.partition(":")[0] for fields in (properties, *assets.values()) for key in fields}
@@ -219,7 +223,7 @@ def _raster(key: str, info: "RasterInfo", bands: Bands, report: Mapping[str, Any
     unit = "degree" if key in {"azimuthal_width", "angles"} else None
     common = {"data_type": info.dtype.name, "nodata": nodata, "unit": unit}
     scaling = zip(info.scales, info.offsets, strict=True)
-    asset = _asset(info.path.name, "image/tiff; application=geotiff", *RASTERS[key])
+    asset = _asset(info.path.name, VRT if info.path.suffix == ".vrt" else TIFF, *RASTERS[key])
     asset["bands"] = [{"name": name} for name in info.names]
     asset["raster:bands"] = [_known(**common, scale=scale, offset=offset) for scale, offset in scaling]
     if key in {"corrected", "removed", "uncertainty"}:

@@ -4,6 +4,7 @@ GDAL never applies scale and offset; neither does anything here: blocks hold sto
 """
 
 from tscorr.rasters.header import IMAGE_TYPES, RasterInfo, can_hold, check_metric, check_overlap, describe, opened
+from tscorr.rasters.joining import join_rows, result
 from tscorr.rasters.reading import Reader, read_decimated, read_decimated_flags
 from tscorr.rasters.writing import Layer, Writer, make_cog
 
@@ -17,8 +18,10 @@ __all__ = [
     "check_metric",
     "check_overlap",
     "describe",
+    "join_rows",
     "make_cog",
     "opened",
     "read_decimated",
     "read_decimated_flags",
+    "result",
 ]

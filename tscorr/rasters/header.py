@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from rasterio.errors import RasterioError
 from rasterio.warp import transform_bounds
 
 from tscorr.errors import InputError
-from tscorr.grid import Grid
+from tscorr.grid import Block, Grid
 from tscorr.rasters.sound import check_sound, open_dataset
 
 IMAGE_TYPES = ("uint8", "int16", "uint16", "float32")
@@ -44,26 +44,33 @@ class RasterInfo:
     colors: tuple[ColorInterp, ...] = ()
     files: tuple[Path, ...] = ()
     """the raster, and what GDAL reads beside it: header, overviews, mask, world file"""
+    ours: bool = False
+    """written by this program: may be a VRT"""
 
     @property
     def shape(self) -> tuple[int, int]:
         """(rows, cols)."""
         return self.grid.shape
 
+    def crop(self, block: Block) -> "RasterInfo":
+        """The header that a raster of one block of this one has."""
+        return replace(self, grid=self.grid.crop(block))
+
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def opened(path: Path, *, ours: bool = False) -> Iterator[Any]:
     """A dataset open for reading; InputError names the file where GDAL cannot."""
     try:
-        with rasterio.Env(**ENVIRONMENT), open_dataset(path) as dataset:
+        with rasterio.Env(**ENVIRONMENT), open_dataset(path, ours=ours) as dataset:
             yield dataset
     except RasterioError as error:
         raise InputError(f"{path} cannot be read: {reason_of(error, path)}") from None
 
 
-def describe(path: str | Path) -> RasterInfo:
+def describe(path: str | Path, *, ours: bool = False) -> RasterInfo:
     """The header of a raster, checked before a pixel is read.
 
+    ours : a result of this program, which may be a VRT.
     Raises InputError where the file is missing, is no raster, or declares what no honest file does.
     """
     path = Path(path)
@@ -71,7 +78,7 @@ def describe(path: str | Path) -> RasterInfo:
         raise InputError(f"{path} does not exist")
     if not path.is_file():
         raise InputError(f"{path} is no file; allowed is a raster")
-    with opened(path) as dataset:
+    with opened(path, ours=ours) as dataset:
         check_sound(dataset, path)
         dtype = np.dtype(dataset.dtypes[0])
         rows, cols = dataset.block_shapes[0]
@@ -93,6 +100,7 @@ def describe(path: str | Path) -> RasterInfo:
             band_tags=tuple({ns: dataset.tags(i, ns=ns) for ns in ("", "IMAGERY")} for i in dataset.indexes),
             colors=tuple(dataset.colorinterp),
             files=(path, *(Path(file) for file in dataset.files[1:])),
+            ours=ours,
         )
 
 

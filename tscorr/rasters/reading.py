@@ -91,7 +91,7 @@ class Reader:
         """The handle of the calling thread."""
         if not hasattr(self._local, "dataset"):
             with rasterio.Env(**ENVIRONMENT):
-                source = open_dataset(self.info.path)
+                source = open_dataset(self.info.path, ours=self.info.ours)
                 dataset = source if self._aligned else self._warped(source)
             with self._lock:
                 self._handles += [dataset] if dataset is source else [dataset, source]
@@ -158,7 +158,7 @@ def read_decimated(info: RasterInfo, max_size: int, bands: Sequence[int] | None 
     step = max(1.0, max(rows, cols) / max_size)
     shape = max(1, round(rows / step)), max(1, round(cols / step))
     indexes = list(bands or range(1, info.bands + 1))
-    with opened(info.path) as dataset:
+    with opened(info.path, ours=info.ours) as dataset:
         values = dataset.read(indexes, out_shape=(len(indexes), *shape), resampling=Resampling.average, masked=True)
     filled = np.ma.filled(values.astype(np.float32), np.nan)
     filled[~np.isfinite(filled)] = np.nan
@@ -169,5 +169,5 @@ def read_decimated_flags(info: RasterInfo, max_size: int) -> Array:
     """A flag layer on the pixels of `read_decimated`: (rows, cols), the nearest value."""
     rows, cols = info.shape
     step = max(1.0, max(rows, cols) / max_size)
-    with opened(info.path) as dataset:
+    with opened(info.path, ours=info.ours) as dataset:
         return dataset.read(1, out_shape=(max(1, round(rows / step)), max(1, round(cols / step))))

@@ -22,6 +22,8 @@ from tscorr.grid import Grid
 
 DRIVERS = ("GTiff", "ENVI", "HFA", "JP2OpenJPEG", "PNG", "JPEG", "AAIGrid", "EHdr")
 """formats that are opened; a VRT from an unknown hand may name any file of the machine"""
+RESULTS = ("GTiff", "VRT")
+"""formats that are written"""
 NUMBERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64")
 LARGEST_TILE_BYTES = 256e6
 MOST_PIXELS = 1e11
@@ -35,13 +37,14 @@ PARTS = {".ovr": "GTiff", ".msk": "GTiff", ".aux": "HFA"}
 """files beside a raster that hold pixels of it too, and their formats"""
 
 
-def open_dataset(path: Path, **options: Any) -> Any:
+def open_dataset(path: Path, *, ours: bool = False, **options: Any) -> Any:
     """A dataset of one of DRIVERS, tried one after the other so that no other driver sees the file.
 
+    ours : a result of this program: one of RESULTS.
     Raises RasterioError with the reason of the driver that knew the format.
     """
     reasons = []
-    for driver in DRIVERS:
+    for driver in RESULTS if ours else DRIVERS:
         try:
             return rasterio.open(path, driver=driver, sharing=False, **options)
         except RasterioError as error:

@@ -19,7 +19,7 @@ from tscorr.grid import Block, Grid, longitude_latitude
 from tscorr.report import SceneFacts, page, summary, write_json
 from tscorr.scene.pictures import PICTURE_PX, draw_quicklook
 from tscorr.scene.plan import Scene
-from tscorr.scene.run import Pipeline, Progress, silent
+from tscorr.scene.run import Pipeline, Progress, Sums, silent
 from tscorr.scene.truth import residual_glare
 from tscorr.sensor import FrameView
 from tscorr.sun import solar_path
@@ -53,39 +53,48 @@ def target_of(scene: Scene) -> Path:
     return Path(scene.config.output.directory) / scene.name
 
 
-def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
-    """Correct a scene and publish its folder; the content of its report.json."""
+def correct_scene(scene: Scene, progress: Progress = silent, key: str | None = None) -> dict[str, Any]:
+    """Correct a scene and publish its folder; the content of its report.json.
+
+    key : the scene's resume key where the inputs are known by other paths; default: as of now, before they are read.
+    """
     started = time.perf_counter()
+    key = key or resume_key(scene)
     with closing(scene), publish.Publication(target_of(scene)) as publication:
         pipeline = Pipeline(scene, publication.folder)
         pipeline.run(progress)
-        facts = facts_of(scene, pipeline, time.perf_counter() - started)
-        folder = publication.folder
-        report = summary(facts)
-        corrected = folder / "corrected.tif"
-        if corrected.exists() and (residual := residual_glare(scene, corrected)) is not None:
-            report["residual_glare"] = residual
-        picture = draw_quicklook(scene, folder) if scene.config.output.quicklook else None
-        write_json(report, folder / "report.json")
-        widths = _decimated_widths(folder)
-        (folder / "report.html").write_text(page(report, facts, picture, widths), encoding="utf-8")
-        write_json(stac_item(scene, folder, facts, report), folder / "item.json")
-        (folder / "settings.toml").write_text(tomli_w.dumps(settings_of(scene)), encoding="utf-8")
-        publication.commit(
-            {
-                "scene": scene.name,
-                "tscorr": __version__,
-                "key": resume_key(scene),
-                "inputs": {str(path): {"sha256": publish.sha256(path)} for path in scene.inputs},
-            }
-        )
+        return finish(scene, publication, pipeline.sums, time.perf_counter() - started, key)
+
+
+def finish(scene: Scene, publication: publish.Publication, sums: Sums, wall_s: float, key: str) -> dict[str, Any]:
+    """Write what stands beside the rasters of a scene, and publish; the content of its report.json."""
+    folder = publication.folder
+    facts = facts_of(scene, sums, wall_s)
+    report = summary(facts)
+    corrected = rasters.result(folder, "corrected")
+    if corrected is not None and (residual := residual_glare(scene, corrected)) is not None:
+        report["residual_glare"] = residual
+    picture = draw_quicklook(scene, folder) if scene.config.output.quicklook else None
+    write_json(report, folder / "report.json")
+    widths = _decimated_widths(folder)
+    (folder / "report.html").write_text(page(report, facts, picture, widths), encoding="utf-8")
+    write_json(stac_item(scene, folder, facts, report), folder / "item.json")
+    (folder / "settings.toml").write_text(tomli_w.dumps(settings_of(scene)), encoding="utf-8")
+    publication.commit(
+        {
+            "scene": scene.name,
+            "tscorr": __version__,
+            "key": key,
+            "inputs": {str(path): {"sha256": publish.sha256(path)} for path in scene.inputs},
+        }
+    )
     return report
 
 
-def facts_of(scene: Scene, pipeline: Pipeline, wall_s: float) -> SceneFacts:
+def facts_of(scene: Scene, sums: Sums, wall_s: float) -> SceneFacts:
     """What the report needs to know of a finished scene."""
     zenith, azimuth = view_samples(scene)
-    sun, sums = scene.sun, pipeline.sums
+    sun = scene.sun
     middle = zenith.shape[0] // 2, zenith.shape[1] // 2
     centre = float(zenith[middle]), float(azimuth[middle])
     return SceneFacts(
@@ -109,7 +118,7 @@ def facts_of(scene: Scene, pipeline: Pipeline, wall_s: float) -> SceneFacts:
         centre_view_deg=centre if np.isfinite(centre).all() else None,
         camera_height_m=scene.view.position[2] - scene.ground_level_m if isinstance(scene.view, FrameView) else None,
         seconds={"wall": wall_s, **sums.seconds},
-        peak_rss_mb=peak_rss_mb(),
+        peak_rss_mb=max(sums.peak_rss_mb, peak_rss_mb()),
         version=__version__,
     )
 
@@ -161,7 +170,8 @@ def stac_item(scene: Scene, folder: Path, facts: SceneFacts, report: Mapping[str
         name=scene.name,
         grid=scene.grid,
         datetime=scene.sun.time,
-        files={path.stem: rasters.describe(path) for path in sorted(folder.glob("*.tif"))},
+        files=_results(scene, folder),
+        strips=sorted(path.name for path in folder.glob("*.*.tif")),
         inputs=scene.inputs,
         solar_zenith_deg=facts.solar_zenith_deg,
         solar_azimuth_deg=facts.solar_azimuth_deg,
@@ -174,9 +184,15 @@ def stac_item(scene: Scene, folder: Path, facts: SceneFacts, report: Mapping[str
     )
 
 
+def _results(scene: Scene, folder: Path) -> dict[str, rasters.RasterInfo]:
+    """The rasters written, by product."""
+    found = {product: rasters.result(folder, product) for product in sorted(scene.config.output.products)}
+    return {product: info for product, info in found.items() if info is not None}
+
+
 def _decimated_widths(folder: Path) -> Array | None:
-    path = folder / "azimuthal_width.tif"
-    return rasters.read_decimated(rasters.describe(path), PICTURE_PX)[0] if path.exists() else None
+    info = rasters.result(folder, "azimuthal_width")
+    return None if info is None else rasters.read_decimated(info, PICTURE_PX)[0]
 
 
 def peak_rss_mb() -> float:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from functools import partial
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -29,6 +30,7 @@ SAMPLES = 4
 """the survey looks at SAMPLES x SAMPLES windows of SAMPLE_PX"""
 MARGIN_PX = 512
 """pixels around the image that are looked at for what they hide; farther things cast no shadow"""
+LIT, SEEN = "lit.npy", "seen.npy"
 
 
 class Ground:
@@ -109,12 +111,27 @@ class Ground:
         )
         return GivenNormals(normals.read, dsm)
 
-    def prepare(self) -> None:
-        """Find what is in shadow and what is hidden, once, before the first block is asked for."""
+    def prepare(self, masks: Path | None = None) -> None:
+        """Find what is in shadow and what is hidden, once, before the first block is asked for.
+
+        masks : a folder that `save` wrote to; what it wrote is taken from there.
+        """
         if self._heights is None or not self._scene.settings.shadows:
+            return
+        if masks is not None:
+            self._lit, self._seen = (
+                BitMask.load(masks / name, self._scene.image.shape) if (masks / name).exists() else None
+                for name in (LIT, SEEN)
+            )
             return
         self._lit = self._swept(lambda **scene: shadows.DirectionSweep(direction=self._sun(), **scene), self._sun())
         self._seen = self._seen_mask()
+
+    def save(self, folder: Path) -> None:
+        """Write what `prepare` found, where it found anything."""
+        for name, mask in ((LIT, self._lit), (SEEN, self._seen)):
+            if mask is not None:
+                mask.save(folder / name)
 
     def _sun(self) -> Array:
         return self._scene.sun.center

@@ -34,7 +34,7 @@ UNKNOWN = int(SpecularState.NOT_ASSESSED) << 6
 def overlaps(results: Sequence[tuple[Scene, Path]]) -> list[Overlap]:
     """The differences of scenes that share ground, each given with the folder of its result.
 
-    Scenes of other bands, or whose results lack corrected.tif or flags.tif, are not compared.
+    Scenes of other bands, or whose results lack the image or the flags, are not compared.
     """
     whole = [(scene, folder) for scene, folder in results if _layers(folder) is not None]
     shared = [
@@ -48,9 +48,9 @@ def overlaps(results: Sequence[tuple[Scene, Path]]) -> list[Overlap]:
     return [difference(one, two, region) for region, one, two in shared[:MOST_PAIRS]]
 
 
-def _layers(folder: Path) -> tuple[Path, Path] | None:
-    files = folder / "corrected.tif", folder / "flags.tif"
-    return files if all(file.exists() for file in files) else None
+def _layers(folder: Path) -> tuple[rasters.RasterInfo, rasters.RasterInfo] | None:
+    corrected, flags = (rasters.result(folder, product) for product in ("corrected", "flags"))
+    return None if corrected is None or flags is None else (corrected, flags)
 
 
 def common_region(grid: Grid, other: Grid) -> Block | None:
@@ -133,8 +133,8 @@ class _Seen:
     def __init__(self, scene: Scene, folder: Path, grid: Grid, files: ExitStack) -> None:
         layers = _layers(folder)
         if layers is None:
-            raise InputError(f"{folder} holds no corrected.tif and flags.tif to compare")
-        corrected, flags = map(rasters.describe, layers)
+            raise InputError(f"{folder} holds no corrected image and flags to compare")
+        corrected, flags = layers
         self._layers = {
             "image": files.enter_context(rasters.Reader(scene.image, grid)),
             "corrected": files.enter_context(rasters.Reader(corrected, grid)),

@@ -27,18 +27,17 @@ def draw_quicklook(scene: Scene, folder: Path) -> Path:
     wavelengths = scene.wavelengths_um or (float("nan"),) * image.bands
     matrix = quicklook.rgb_matrix(wavelengths, image.fwhm_um)
     used = quicklook.used_bands(matrix)
-    corrected = folder / "corrected.tif"
-    result = rasters.describe(corrected) if corrected.exists() else image
+    result = rasters.result(folder, "corrected") or image
     scale, offset = scene.stored.scale, scene.stored.offset
     before, after = (
         quicklook.linear_rgb(_reflectance(info, used, scale, offset, PICTURE_PX), matrix[used])
         for info in (image, result)
     )
     path = folder / "quicklook.png"
-    flag_file = folder / "flags.tif"
+    flag_file = rasters.result(folder, "flags")
     flags = np.zeros(before.shape[:2], np.uint16)
-    if flag_file.exists():
-        flags = rasters.read_decimated_flags(rasters.describe(flag_file), PICTURE_PX)
+    if flag_file is not None:
+        flags = rasters.read_decimated_flags(flag_file, PICTURE_PX)
     note = quicklook.rendering_note(wavelengths, matrix)
     quicklook.before_after(before, after, flags, path, title=scene.name, note=note)
     return path

@@ -75,6 +75,8 @@ class Sums:
             ("blocks", "blocks_no_specular_material", "blocks_out_of_reach", "blocks_shadow_or_nodata"), 0
         )
         self.seconds = dict.fromkeys(("read", "geometry", "kernel", "write"), 0.0)
+        self.peak_rss_mb = 0.0
+        """of other processes that worked on the scene"""
         self._lock = threading.Lock()
 
     def add(self, result: BlockResult, kind: str | None) -> None:
@@ -123,17 +125,26 @@ def units(image: rasters.RasterInfo, memory_limit_mb: int, workers: int) -> list
     ]
 
 
-def units_of(scene: Scene) -> list[Block]:
-    """The blocks of a scene under its configuration's memory limit."""
-    return units(scene.image, scene.config.run.memory_limit_mb, workers_of(scene))
+def units_of(scene: Scene, strip: Block | None = None) -> list[Block]:
+    """The blocks of a scene, or of a strip of it, under its configuration's memory limit."""
+    limit, workers = scene.config.run.memory_limit_mb, workers_of(scene)
+    if strip is None:
+        return units(scene.image, limit, workers)
+    return [block.below(strip.row) for block in units(scene.image.crop(strip), limit, workers)]
 
 
 class Pipeline:
-    """The work on one scene: open files, one method a block, and the rasters being written."""
+    """The work on one scene: open files, one method a block, and the rasters being written.
 
-    def __init__(self, scene: Scene, folder: Path) -> None:
+    strip : rows of the scene to do, all columns of them; all if None.
+    masks : what `Ground.save` wrote of the whole scene; found by this pipeline itself if None.
+    """
+
+    def __init__(self, scene: Scene, folder: Path, strip: Block | None = None, masks: Path | None = None) -> None:
         self.scene = scene
         self.folder = folder
+        self._strip = strip
+        self._masks = masks
         self.corrector = Corrector(
             scene.materials, scene.stored, skip=scene.config.run.skip, tally_stride=scene.tally_stride
         )
@@ -164,10 +175,10 @@ class Pipeline:
             self.open(files)
             if self.corrector.peaks.any():
                 with self.sums.timed("geometry"):
-                    self.ground.prepare()
+                    self.ground.prepare(self._masks)
             self.writers = {name: self._writer(name) for name in sorted(self._products)}
             try:
-                run_all(self.block, units_of(scene), workers_of(scene), progress)
+                run_all(self.block, units_of(scene, self._strip), workers_of(scene), progress)
             except BaseException:
                 for writer in self.writers.values():
                     writer.abandon()
@@ -195,7 +206,7 @@ class Pipeline:
             layers["removed"] = result.removed
         with self.sums.timed("write"):
             for name, writer in self.writers.items():
-                writer.write(block, layers[name])
+                writer.write(block if self._strip is None else block.below(-self._strip.row), layers[name])
         self.sums.add(result, skipped)
         return rows.size
 
@@ -303,7 +314,8 @@ class Pipeline:
         }
         if name not in {"corrected", "removed"} and profile.get("compress") in {None, "none"}:
             profile["compress"] = "deflate"
-        return rasters.Writer(self.folder / f"{name}.tif", profile, image, layers[name])
+        like = image if self._strip is None else image.crop(self._strip)
+        return rasters.Writer(self.folder / f"{name}.tif", profile, like, layers[name])
 
 
 FLAG_TAGS = {f"FLAG_BIT_{flag.value.bit_length() - 1}": str(flag.name) for flag in SINGLE_FLAGS} | {

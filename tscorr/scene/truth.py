@@ -1,7 +1,5 @@
 """Residual glare of a synthetic scene, whose truth is known."""
 
-from pathlib import Path
-
 import numpy as np
 
 from tscorr import rasters
@@ -11,7 +9,7 @@ from tscorr.scene.plan import Scene
 LEAST_SHARE = 0.05
 
 
-def residual_glare(scene: Scene, corrected: Path) -> dict[str, float | None] | None:
+def residual_glare(scene: Scene, corrected: rasters.RasterInfo) -> dict[str, float | None] | None:
     """RMS error of the image and of its correction against the truth, and their ratio; None without a truth.
 
     Over the bands of valid, sunlit pixels without a saturated band whose true specular share exceeds 5 % in
@@ -26,7 +24,7 @@ def residual_glare(scene: Scene, corrected: Path) -> dict[str, float | None] | N
     count = 0
     with (
         rasters.Reader(scene.image) as image,
-        rasters.Reader(rasters.describe(corrected)) as result,
+        rasters.Reader(corrected) as result,
         rasters.Reader(diffuse) as true,
         rasters.Reader(sunlit) as light,
     ):

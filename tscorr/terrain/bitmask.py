@@ -1,6 +1,7 @@
 """A mask of a whole scene at one bit a pixel."""
 
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,18 @@ Mask = NDArray[np.bool_]
 class BitMask:
     """True everywhere at first; `narrow` clears pixels, `read` answers for blocks, which may reach outside."""
 
-    def __init__(self, shape: tuple[int, int]) -> None:
+    def __init__(self, shape: tuple[int, int], bits: NDArray[Any] | None = None) -> None:
         self._shape = shape
-        self._bits: NDArray[Any] = np.full((shape[0], -(-shape[1] // 8)), 255, np.uint8)
+        self._bits = np.full((shape[0], -(-shape[1] // 8)), 255, np.uint8) if bits is None else bits
+
+    def save(self, path: Path) -> None:
+        """Write the mask as an array of bytes."""
+        np.save(path, self._bits)
+
+    @classmethod
+    def load(cls, path: Path, shape: tuple[int, int]) -> Self:
+        """A mask as `save` wrote it; of the file, only what is asked for is read."""
+        return cls(shape, np.load(path, mmap_mode="r"))
 
     def narrow(self, block: Block, mask: Mask) -> None:
         """Keep of a block only what `mask` (rows, cols) says; what lies outside the scene is ignored."""
