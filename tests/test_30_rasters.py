@@ -23,6 +23,7 @@ from small_scene import BANDS, CELL, CRS, NORTH, SHAPE, WEST, image_values, writ
 from tscorr import rasters
 from tscorr.errors import InputError, OutputError
 from tscorr.grid import Block, Grid, blocks
+from tscorr.rasters import tiff
 
 WHOLE = Block(0, 0, *SHAPE)
 NAN = float("nan")
@@ -409,7 +410,7 @@ def test_values_and_everything_about_them_survive_a_round_trip(tmp_path, dtype, 
     with rasterio.open(path, "r+") as file:
         file.offsets = (0.01, 0.02, 0.03)
     info = rasters.describe(path)
-    copy = copied(info, tmp_path / "copy.tif")
+    copy = copied(info, tmp_path / "copy.tif", (16, SHAPE[1]))
     with rasterio.open(path) as before, rasterio.open(copy.path) as after:
         np.testing.assert_array_equal(after.read(), before.read())
         for name in (
@@ -466,26 +467,108 @@ def test_a_layer_of_its_own_has_no_tags_of_the_image(tmp_path):
         assert file.descriptions == ("angle",)
 
 
-def test_a_file_that_changed_under_the_writer_does_not_pass(tmp_path):
-    info = rasters.describe(write_image(tmp_path / "image.tif", compress="none", interleave="band"))
-    path = tmp_path / "copy.tif"
+def half_written(path, **profile):
+    """A writer that wrote one of the two blocks of an image, the values, and a function that writes the other."""
+    info = rasters.describe(write_image(path.with_name("image.tif"), **profile))
     writer = rasters.Writer(path, info.profile, info, layer_of(info))
     values = image_values()
-    writer.write(WHOLE, values)
-    dataset = writer._dataset
+    upper, lower = Block(0, 0, 16, 64), Block(16, 0, 32, 64)
+    writer.write(upper, values[:, *upper.slices])
+    return writer, values, lambda: writer.write(lower, values[:, *lower.slices])
 
-    class Careless:
-        """A disk that loses 16 bytes of a file that was closed."""
 
-        def close(self):
-            dataset.close()
-            content = path.read_bytes()
-            place = content.index(values[1, 3, :8].tobytes())
-            path.write_bytes(content[:place] + bytes(16) + content[place + 16 :])
-
-    writer._dataset = Careless()
-    with pytest.raises(OutputError, match=rf"{path} does not read back as written at .*is the disk full"):
+@pytest.mark.parametrize("interleave", ["band", "pixel"])
+@pytest.mark.parametrize("codec", ["none", "deflate", "zstd"])
+def test_a_file_that_loses_some_bytes_does_not_pass(tmp_path, codec, interleave):
+    path = tmp_path / "copy.tif"
+    writer, _, finish = half_written(path, compress=codec, interleave=interleave)
+    finish()
+    size = path.stat().st_size
+    with path.open("r+b") as file:
+        file.seek(size - size // 3)
+        file.write(bytes(16))
+    with pytest.raises(OutputError, match=rf"{path} does not read back as written; is the disk full"):
         writer.close()
+
+
+def test_a_file_that_lacks_a_block_does_not_pass(tmp_path):
+    writer, *_ = half_written(tmp_path / "copy.tif")
+    with pytest.raises(OutputError, match=r"copy\.tif does not read back as written"):
+        writer.close()
+
+
+def test_a_file_whose_header_is_lost_does_not_pass(tmp_path):
+    path = tmp_path / "copy.tif"
+    writer, _, finish = half_written(path)
+    finish()
+    with path.open("r+b") as file:
+        file.write(bytes(64))
+    with pytest.raises(OutputError, match=r"copy\.tif does not read back as written"):
+        writer.close()
+
+
+def test_blocks_that_cut_tiles_are_refused(tmp_path):
+    writer, values, _ = half_written(tmp_path / "copy.tif")
+    with pytest.raises(ValueError, match=r"Block\(row=16, .* does not consist of whole tiles of \(16, 16\)"):
+        writer.write(Block(16, 0, 20, 64), values[:, 16:36])
+    writer.abandon()
+
+
+@pytest.mark.parametrize("compress", ["none", "deflate", "lzw", "zstd", "packbits"])
+@pytest.mark.parametrize("interleave", ["band", "pixel"])
+@pytest.mark.parametrize("cut", ["tiles", "strips"])
+def test_tiles_that_reach_over_the_edge_are_as_gdal_writes_them(tmp_path, compress, interleave, cut):
+    values = np.random.default_rng(12).integers(0, 900, (BANDS, 41, 57)).astype(np.uint16)
+    tiles = {} if cut == "tiles" else {"tiled": False, "blockysize": 16}
+    path = write_raster(tmp_path / "x.tif", values, compress=compress, interleave=interleave, **tiles)
+    info = rasters.describe(path)
+    width = 32 if cut == "tiles" else 57
+    for block_shape in ((16, width), (41, 57)):
+        copy = copied(info, tmp_path / "copy.tif", block_shape)
+        with rasterio.open(copy.path) as after:
+            np.testing.assert_array_equal(after.read(), values)
+            assert after.block_shapes[0] == info.tile
+
+
+def test_many_threads_write_the_file_that_one_writes(tmp_path):
+    values = np.random.default_rng(13).integers(0, 900, (BANDS, 320, 320)).astype(np.uint16)
+    info = rasters.describe(write_raster(tmp_path / "x.tif", values, compress="zstd"))
+    writer = rasters.Writer(tmp_path / "copy.tif", info.profile, info, layer_of(info))
+    with ThreadPoolExecutor(8) as pool:
+        todo = list(blocks(info.shape, (32, 48)))
+        list(pool.map(lambda block: writer.write(block, values[:, *block.slices]), todo))
+    writer.close()
+    with rasterio.open(tmp_path / "copy.tif") as file:
+        np.testing.assert_array_equal(file.read(), values)
+
+
+@pytest.mark.parametrize("bigtiff", ["yes", "no"])
+@pytest.mark.parametrize("endianness", ["big", "little"])
+@pytest.mark.parametrize("tile", [16, 64])
+def test_places_of_tiles_are_those_that_gdal_names(tmp_path, bigtiff, endianness, tile):
+    options = {"bigtiff": bigtiff, "endianness": endianness, "blockxsize": tile, "blockysize": tile}
+    path = write_raster(tmp_path / "x.tif", image_values(), interleave="band", **options)
+    content = path.read_bytes()
+    places = tiff.directory(content)
+    with rasterio.open(path) as file:
+        layout = tiff.Layout(file.shape, (tile, tile), BANDS)
+        named = {
+            what: [
+                int(file.get_tag_item(f"BLOCK_{what}_{j}_{i}", "TIFF", bidx=band))
+                for band in file.indexes
+                for i, j in np.ndindex(layout.tiles)
+            ]
+            for what in ("OFFSET", "SIZE")
+        }
+    assert places.offsets.of(content).tolist() == named["OFFSET"]
+    assert places.sizes.of(content).tolist() == named["SIZE"]
+    np.testing.assert_array_equal(layout.numbers(WHOLE).ravel(), np.arange(len(named["SIZE"])))
+
+
+@pytest.mark.parametrize("content", [b"", b"II*\0", b"GIF89a..........", b"II*\0\x08\0\0\0\0\0\0\0"])
+def test_what_is_no_tiff_has_no_places(content):
+    with pytest.raises(ValueError, match="no whole TIFF"):
+        tiff.directory(content)
 
 
 def test_a_folder_that_does_not_exist_is_named(tmp_path):

@@ -56,6 +56,11 @@ class RasterInfo:
         """The header that a raster of one block of this one has."""
         return replace(self, grid=self.grid.crop(block))
 
+    @property
+    def written_tile(self) -> tuple[int, int]:
+        """(rows, cols) that are stored together in a GeoTIFF like this one."""
+        return self.profile["blockysize"], self.profile.get("blockxsize", self.shape[1])
+
 
 @contextmanager
 def opened(path: Path, *, ours: bool = False) -> Iterator[Any]:

@@ -1,22 +1,23 @@
 """Rasters written block by block, and read again before they count as written."""
 
+import os
 import threading
-import zlib
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.enums import ColorInterp, Resampling
+from rasterio.enums import ColorInterp, Interleaving, Resampling
 from rasterio.errors import RasterioError
 from rasterio.shutil import copy as copy_raster
 
 from tscorr.errors import OutputError
 from tscorr.grid import Block
+from tscorr.rasters import tiff
+from tscorr.rasters.encoding import Encoder
 from tscorr.rasters.header import ENVIRONMENT, RasterInfo
 
 Array = NDArray[Any]
@@ -25,81 +26,143 @@ COG_TILE = 512
 
 
 class Writer:
-    """One raster being written; any thread may write, each block once.
+    """One raster being written; any thread may write, each tile once.
 
-    `close` reads every block again and compares it with what was written: GDAL's threads hide a full disk.
+    Each thread encodes its own tiles and puts them behind those that are there, by calls of the operating system that
+    raise where a disk is full; GDAL, whose writing threads would hide that, writes the header only. `close` reads
+    every byte of the tiles again and compares it with what was written.
     """
 
     def __init__(self, path: Path, profile: dict[str, Any], like: RasterInfo, layer: "Layer") -> None:
         self.path = path
         self._lock = threading.Lock()
-        self._written: dict[Block, int] = {}
-        bands = len(layer.names)
+        self._written: list[_Stretch] = []
+        self._sample: tuple[Block, int] | None = None
         rows, cols = like.shape
-        options = {
-            **profile,
-            "driver": "GTiff",
-            "height": rows,
-            "width": cols,
-            "count": bands,
-            "dtype": layer.dtype,
-            "crs": like.grid.crs,
-            "transform": like.grid.transform,
-            "nodata": layer.nodata,
-            "bigtiff": "if_safer",
-            "num_threads": "all_cpus",
-        }
+        options = _fitting_predictor(
+            {
+                **profile,
+                "driver": "GTiff",
+                "height": rows,
+                "width": cols,
+                "count": len(layer.names),
+                "dtype": layer.dtype,
+                "crs": like.grid.crs,
+                "transform": like.grid.transform,
+                "nodata": layer.nodata,
+                "bigtiff": "if_safer",
+                "sparse_ok": True,
+            },
+            np.dtype(layer.dtype),
+        )
         try:
-            with rasterio.Env(**ENVIRONMENT):
-                self._dataset = rasterio.open(path, "w", **_fitting_predictor(options, np.dtype(layer.dtype)))
-                self._describe(layer, like)
-        except RasterioError as error:
+            with rasterio.Env(**ENVIRONMENT), rasterio.open(path, "w", **options) as dataset:
+                _describe(dataset, layer, like)
+                planes = dataset.count if dataset.interleaving == Interleaving.band else 1
+                self._layout = tiff.Layout(dataset.shape, dataset.block_shapes[0], planes)
+            header = path.read_bytes()
+            self._places = tiff.directory(header)
+            self._file = os.open(path, os.O_RDWR)
+        except (RasterioError, OSError, ValueError) as error:
             raise OutputError(f"{path} cannot be written: {error}") from None
-
-    def _describe(self, layer: "Layer", like: RasterInfo) -> None:
-        dataset = self._dataset
-        dataset.update_tags(**{**(like.tags if layer.of_image else {}), **layer.tags})
-        for index, name in enumerate(layer.names, start=1):
-            dataset.set_band_description(index, name)
-            if layer.of_image:
-                for domain, tags in like.band_tags[index - 1].items():
-                    if domain:
-                        dataset.update_tags(index, ns=domain, **tags)
-                    else:
-                        dataset.update_tags(index, **tags)
-        if layer.of_image and like.colors and ColorInterp.palette not in like.colors:
-            dataset.colorinterp = like.colors  # else GDAL takes the fourth of four bytes for transparency
-        if layer.scales is not None:
-            dataset.scales, dataset.offsets = layer.scales, layer.offsets
-        if layer.units is not None:
-            dataset.units = layer.units
+        self._end = len(header)
+        self._offsets, self._sizes = self._places.offsets.of(header), self._places.sizes.of(header)
+        self._encoder = Encoder(options, self._layout, tiled=bool(options.get("tiled")))
 
     def write(self, block: Block, values: Array) -> None:
-        """Write a block (bands, rows, cols)."""
-        values = np.ascontiguousarray(values)
+        """Write a block of whole tiles (bands, rows, cols)."""
+        numbers = self._layout.numbers(block).ravel()
         try:
-            with self._lock:
-                self._dataset.write(values, window=block.window)
-                self._written[block] = zlib.crc32(values.data)
-        except RasterioError as error:
+            with self._encoder(values) as tiles:
+                with self._lock:
+                    start, self._end = self._end, self._end + len(tiles.data)
+                    self._sample = self._sample or (block, checksum(np.ascontiguousarray(values).data))
+                _write(self._file, tiles.data, start)
+                written = _Stretch(start, len(tiles.data), checksum(tiles.data))
+                with self._lock:
+                    self._written.append(written)
+                    self._offsets[numbers], self._sizes[numbers] = start + tiles.offsets, tiles.sizes
+        except (RasterioError, OSError) as error:
             raise OutputError(f"{self.path} cannot be written: {error}") from None
 
     def abandon(self) -> None:
         """Close without a check; what was written will be deleted."""
-        with self._lock, suppress(RasterioError):
-            self._dataset.close()
+        os.close(self._file)
 
     def close(self) -> None:
         """Close, and raise OutputError unless every block reads back as it was written."""
         try:
-            with self._lock:
-                self._dataset.close()
-            with rasterio.Env(**ENVIRONMENT), rasterio.open(self.path, sharing=False) as dataset:
-                for block, checksum in self._written.items():
-                    if zlib.crc32(dataset.read(window=block.window).data) != checksum:
-                        raise OutputError(f"{self.path} does not read back as written at {block}; is the disk full?")
-        except RasterioError as error:
+            for words, numbers in zip(self._places, (self._offsets, self._sizes), strict=True):
+                _write(self._file, tiff.octets(numbers.astype(words.dtype)), words.start)
+            whole = bool(self._sizes.all()) and all(
+                checksum(_read(self._file, stretch)) == stretch.checksum for stretch in self._written
+            )
+        except OSError as error:
             raise OutputError(f"{self.path} does not read back as written: {error}; is the disk full?") from None
+        finally:
+            os.close(self._file)
+        if not (whole and self._is_read_by_gdal()):
+            raise OutputError(f"{self.path} does not read back as written; is the disk full?")
+
+    def _is_read_by_gdal(self) -> bool:
+        """Whether a block comes out of the file as it went in: the header is whole too."""
+        if self._sample is None:
+            return False
+        block, expected = self._sample
+        try:
+            with rasterio.Env(**ENVIRONMENT), rasterio.open(self.path, sharing=False) as dataset:
+                return checksum(dataset.read(window=block.window).data) == expected
+        except RasterioError:
+            return False
+
+
+class _Stretch(NamedTuple):
+    """Bytes that were written in one go: where, how many, and their checksum."""
+
+    start: int
+    size: int
+    checksum: int
+
+
+def checksum(data: Any) -> int:
+    """Sum of the 64-bit words of a contiguous buffer and of the bytes behind them.
+
+    At the speed of the memory; what a disk loses shows in it, what someone wants to hide does not.
+    """
+    octets = np.frombuffer(data, np.uint8)
+    words = octets.size // 8 * 8
+    return int(octets[:words].view(np.uint64).sum()) + int(octets[words:].sum())
+
+
+def _write(file: int, data: memoryview, start: int) -> None:
+    """Write all of a buffer at a place of a file; OSError where it does not fit the disk."""
+    done = 0
+    while done < len(data):
+        done += os.pwrite(file, data[done:], start + done)
+
+
+def _read(file: int, stretch: _Stretch) -> bytes:
+    """The bytes of a stretch, fewer where the file ends before."""
+    return os.pread(file, stretch.size, stretch.start)
+
+
+def _describe(dataset: Any, layer: "Layer", like: RasterInfo) -> None:
+    """Give a new raster the names, tags, colours, scales and units of its layer."""
+    dataset.update_tags(**{**(like.tags if layer.of_image else {}), **layer.tags})
+    for index, name in enumerate(layer.names, start=1):
+        dataset.set_band_description(index, name)
+        if layer.of_image:
+            for domain, tags in like.band_tags[index - 1].items():
+                if domain:
+                    dataset.update_tags(index, ns=domain, **tags)
+                else:
+                    dataset.update_tags(index, **tags)
+    if layer.of_image and like.colors and ColorInterp.palette not in like.colors:
+        dataset.colorinterp = like.colors  # else GDAL takes the fourth of four bytes for transparency
+    if layer.scales is not None:
+        dataset.scales, dataset.offsets = layer.scales, layer.offsets
+    if layer.units is not None:
+        dataset.units = layer.units
 
 
 @dataclass(frozen=True, slots=True)

@@ -106,12 +106,12 @@ class Sums:
 
 
 def units(image: rasters.RasterInfo, memory_limit_mb: int, workers: int) -> list[Block]:
-    """Blocks that the work is cut into: whole tiles of the image, stripe by stripe.
+    """Blocks that the work is cut into: whole tiles of the rasters that are written, stripe by stripe.
 
     Results do not depend on the cut; memory and speed do. A block is never less than a tile, whatever the limit.
     """
     rows, cols = image.shape
-    tile_rows, tile_cols = image.tile
+    tile_rows, tile_cols = image.written_tile
     pixel_bytes = image.bands * image.dtype.itemsize
     width = cols if tile_cols >= cols else max(1, UNIT_COLUMNS // tile_cols) * tile_cols
     unit_bytes = max(1e6, (memory_limit_mb - BASE_MB) * 1e6 / (workers * COPIES))
@@ -312,11 +312,14 @@ class Pipeline:
             "azimuthal_width": replace(angles, names=("azimuthal width",), units=("degree",)),
             "angles": angles,
         }
-        if name not in {"corrected", "removed"} and profile.get("compress") in {None, "none"}:
-            profile["compress"] = "deflate"
+        if not layers[name].of_image:
+            profile |= FASTER_CODEC.get(profile["compress"], {})
         like = image if self._strip is None else image.crop(self._strip)
         return rasters.Writer(self.folder / f"{name}.tif", profile, like, layers[name])
 
+
+FASTER_CODEC = {"none": {"compress": "zstd"}, "deflate": {"zlevel": 1}}
+"""for layers that no image set an example for, by the image's codec: flags become small by any, and fast by these"""
 
 FLAG_TAGS = {f"FLAG_BIT_{flag.value.bit_length() - 1}": str(flag.name) for flag in SINGLE_FLAGS} | {
     "FLAG_BITS_6_7": "SPECULAR_STATE: 0 negligible, 1 corrected, 2 uncorrectable, 3 not assessed"
