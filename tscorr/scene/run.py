@@ -318,7 +318,7 @@ class Pipeline:
         return rasters.Writer(self.folder / f"{name}.tif", profile, like, layers[name])
 
 
-FASTER_CODEC = {"none": {"compress": "zstd"}, "deflate": {"zlevel": 1}}
+FASTER_CODEC: dict[str, dict[str, Any]] = {"none": {"compress": "zstd"}, "deflate": {"zlevel": 1}}
 """for layers that no image set an example for, by the image's codec: flags become small by any, and fast by these"""
 
 FLAG_TAGS = {f"FLAG_BIT_{flag.value.bit_length() - 1}": str(flag.name) for flag in SINGLE_FLAGS} | {
