@@ -7,10 +7,11 @@ import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from tscorr import publish
-from tscorr.errors import OutputError
+from tscorr.errors import InputError, OutputError
 
 
 def published(target, content="new", key="k"):
@@ -18,7 +19,7 @@ def published(target, content="new", key="k"):
     with publish.Publication(target) as publication:
         (publication.folder / "a.txt").write_text(content)
         (publication.folder / "b.txt").write_text("b")
-        publication.commit({"key": key})
+        publication.commit({"key": key, "products": ["corrected", "flags"]})
     return target
 
 
@@ -136,17 +137,21 @@ def test_equal_content_has_an_equal_key_and_every_change_changes_it(tmp_path):
     file = tmp_path / "input"
     file.write_text("x")
     settings = {"a": 1, "b": [1, 2]}
-    key = publish.key(settings, [file], "1.0")
-    assert publish.key({"b": [1, 2], "a": 1}, [file], "1.0") == key
-    assert publish.key({**settings, "a": 2}, [file], "1.0") != key
-    assert publish.key(settings, [file], "1.1") != key
-    assert publish.key(settings, [file, file], "1.0") != key
+    whole = publish.identities([file])
+    key = publish.key(settings, whole, "1.0")
+    assert publish.key({"b": [1, 2], "a": 1}, whole, "1.0") == key
+    assert publish.key({**settings, "a": 2}, whole, "1.0") != key
+    assert publish.key(settings, whole, "1.1") != key
+    assert publish.key(settings, {}, "1.0") != key
     os.utime(file, ns=(1, 1))
-    touched = publish.key(settings, [file], "1.0")
+    touched = publish.key(settings, publish.identities([file]), "1.0")
     assert touched != key
     file.write_text("xy")
     os.utime(file, ns=(1, 1))
-    assert publish.key(settings, [file], "1.0") != touched
+    assert publish.key(settings, publish.identities([file]), "1.0") != touched
+    file.unlink()
+    with pytest.raises(InputError, match=f"the input {file} cannot be read: No such file"):
+        publish.identities([file])
 
 
 def test_a_result_is_current_only_with_its_key_and_all_its_files(tmp_path):
@@ -154,6 +159,8 @@ def test_a_result_is_current_only_with_its_key_and_all_its_files(tmp_path):
     assert publish.is_current(target, "k")
     assert not publish.is_current(target, "other")
     assert not publish.is_current(tmp_path / "nix", "k")
+    assert publish.is_current(target, "k", ["corrected"])
+    assert not publish.is_current(target, "k", ["corrected", "angles"])
     (target / "a.txt").write_text("longer than it was")
     assert not publish.is_current(target, "k")
     (target / "a.txt").unlink()
@@ -216,3 +223,28 @@ def test_a_text_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
         publish.write_whole(tmp_path / "page", "new")
     assert [path.name for path in tmp_path.iterdir()] == ["page"]
     assert (tmp_path / "page").read_text() == "old"
+
+
+def test_every_flipped_byte_and_every_strange_file_is_found(tmp_path):
+    target = published(tmp_path / "scene")
+    rng = np.random.default_rng(5)
+    files = sorted(target.iterdir())
+    for path in files:
+        content = path.read_bytes()
+        for place in rng.integers(0, len(content), 60):
+            flipped = bytearray(content)
+            flipped[place] ^= 1 << rng.integers(8)
+            path.write_bytes(flipped)
+            assert publish.damaged(target), (path.name, place)
+        path.write_bytes(content)
+    assert publish.damaged(target) == []
+    (target / "c.txt").write_text("c")
+    assert publish.damaged(target) == [f"{target / 'c.txt'} was not published"]
+
+
+def test_what_killed_runs_left_is_not_taken_for_published(tmp_path):
+    published(tmp_path / "a" / "scene")
+    published(tmp_path / ".b.01234567.old")
+    published(tmp_path / ".c.01234567.part")
+    published(tmp_path / ".d.0123456789ab-512.strips" / "0000")
+    assert publish.published(tmp_path) == [tmp_path / "a" / "scene"]

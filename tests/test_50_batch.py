@@ -1,21 +1,16 @@
 """batch: what is done stays done, what changed is done again, and one broken scene does not stop the rest."""
 
 import json
-import os
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from small_scene import (
     SHAPE,
     TILE,
-    heights,
     small_scene,
     write_config,
-    write_image,
     write_inputs,
-    write_raster,
     write_truncated_image,
 )
 
@@ -76,93 +71,10 @@ def table_of(**changes):
     return {"materials": MATERIALS, "output": {"directory": "out", "quicklook": False}, **changes}
 
 
-@pytest.mark.parametrize(
-    ("sections", "state"),
-    [
-        (table_of(), "current"),
-        (table_of(title="another title"), "current"),
-        (table_of(run={"workers": 1}), "current"),
-        (table_of(model={"form": "simplified"}), "done"),
-        (table_of(model={"form": "full"}), "current"),  # the default
-        (table_of(correction={"uncorrectable_share": 0.5}), "done"),
-        (table_of(output={"directory": "out", "quicklook": False, "products": ["corrected"]}), "done"),
-        (table_of(materials={**MATERIALS, "settings": {"tiles": {"form": "simplified"}}}), "done"),
-        (table_of(materials={**MATERIALS, "classes": {str(TILE): "lambertian"}}), "done"),
-    ],
-)
-def test_a_change_of_the_settings_recomputes_where_it_matters(tmp_path, sections, state):
-    write_inputs(tmp_path)
-    (tmp_path / "own.toml").write_text(LIBRARY.format(t1=0.2))
-    batch.run(write_config(tmp_path, **table_of()))
-    assert states(write_config(tmp_path, **sections)) == {"roofs": state}
-
-
-def change_heights(folder):
-    write_raster(folder / "dsm.tif", heights() + np.float32(0.25))
-
-
-def change_image(folder):
-    write_image(folder / "image.tif", np.full((3, *SHAPE), 4000, np.int16))
-
-
-def change_material(folder):
-    (folder / "own.toml").write_text(LIBRARY.format(t1=0.3))
-
-
-def change_classes(folder):
-    write_raster(folder / "class_map.tif", np.full(SHAPE, TILE, np.uint8))
-
-
-def touch_image(folder):
-    os.utime(folder / "image.tif")
-
-
-def lose_an_output(folder):
-    (folder / "out/roofs/flags.tif").unlink()
-
-
-def cut_an_output(folder):
-    os.truncate(folder / "out/roofs/corrected.tif", 1000)
-
-
-def lose_the_manifest(folder):
-    (folder / "out/roofs/manifest.json").unlink()
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        change_heights,
-        change_image,
-        change_material,
-        change_classes,
-        touch_image,
-        lose_an_output,
-        cut_an_output,
-        lose_the_manifest,
-    ],
-)
-def test_a_changed_input_or_a_lost_output_recomputes(tmp_path, change):
-    write_inputs(tmp_path)
-    (tmp_path / "own.toml").write_text(LIBRARY.format(t1=0.2))
-    config = write_config(tmp_path, **table_of())
-    batch.run(config)
-    change(tmp_path)
-    assert states(config) == {"roofs": "done"}
-    assert states(config) == {"roofs": "current"}
-
-
 def test_a_restricted_run_is_not_taken_for_a_whole_one(tmp_path):
     config = small_scene(tmp_path)
     assert states(config, materials=["roof_tile"]) == {"roofs": "done"}
     assert states(config) == {"roofs": "done"}
-
-
-def test_only_the_scene_that_changed_is_recomputed(tmp_path):
-    write_inputs(tmp_path)
-    batch.run(write_config(tmp_path, {"name": "a"}, {"name": "b"}))
-    config = write_config(tmp_path, {"name": "a"}, {"name": "b", "direct_fraction": 0.5}, {"name": "c"})
-    assert states(config) == {"a": "current", "b": "done", "c": "done"}
 
 
 @pytest.fixture

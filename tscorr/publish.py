@@ -15,11 +15,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from tscorr.errors import OutputError
+from tscorr.errors import InputError, OutputError
 
 MANIFEST = "manifest.json"
+SEAL = "manifest_sha256"
 HIDDEN = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>part|old)")
 """names of what is being made and of what is being replaced"""
+UNFINISHED = re.compile(r"\..+\.(?:part|old|strips)")
 
 
 def hidden_name(target: Path, kind: str) -> Path:
@@ -84,7 +86,7 @@ class Publication:
             files = sorted(path for path in self.folder.iterdir() if path.name != MANIFEST)
             outputs = {path.name: {"sha256": sha256(path), "bytes": path.stat().st_size} for path in files}
             path = self.folder / MANIFEST
-            path.write_text(json.dumps({**manifest, "outputs": outputs}, indent=1) + "\n", encoding="utf-8")
+            path.write_text(_sealed({**manifest, "outputs": outputs}), encoding="utf-8")
             for file in (*files, path):
                 _flush(file)
             _flush(self.folder)
@@ -107,45 +109,56 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def identity(path: Path) -> dict[str, Any]:
-    """What tells one version of an input from another without reading it: name, size, time of change."""
-    status = path.stat()
-    return {"path": str(path.resolve()), "bytes": status.st_size, "changed_ns": status.st_mtime_ns}
+def identities(paths: Iterable[Path]) -> dict[str, dict[str, int]]:
+    """What tells one version of each input from another without reading it: size and time of change, by path.
+
+    Raises InputError where one is gone.
+    """
+    found = {}
+    for path in paths:
+        try:
+            status = path.stat()
+        except OSError as error:
+            raise InputError(f"the input {path} cannot be read: {error.strerror}") from None
+        found[str(path.resolve())] = {"bytes": status.st_size, "changed_ns": status.st_mtime_ns}
+    return found
 
 
-def key(settings: Mapping[str, Any], inputs: Iterable[Path], version: str) -> str:
-    """Digest of everything that a result depends on; equal keys mean that nothing has to be done."""
-    content = {"settings": settings, "inputs": [identity(path) for path in inputs], "version": version}
+def key(settings: Mapping[str, Any], inputs: Mapping[str, Any], version: str) -> str:
+    """Digest of everything that a result depends on; equal keys mean that nothing has to be done.
+
+    inputs : their `identities`.
+    """
+    content = {"settings": settings, "inputs": inputs, "version": version}
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def is_current(target: Path, wanted: str) -> bool:
-    """Whether a published folder is whole and was made with this key."""
+def is_current(target: Path, wanted: str, products: Iterable[str] = ()) -> bool:
+    """Whether a published folder is whole, was made with this key, and has these products at least."""
     manifest = read_manifest(target)
-    if manifest is None or manifest.get("key") != wanted:
+    if manifest is None or manifest.get("key") != wanted or not set(products) <= set(manifest.get("products", ())):
         return False
-    outputs = manifest.get("outputs", {})
     return all(
         (target / name).is_file() and (target / name).stat().st_size == entry["bytes"]
-        for name, entry in outputs.items()
+        for name, entry in manifest["outputs"].items()
     )
 
 
 def read_manifest(target: Path) -> dict[str, Any] | None:
-    """The manifest of a published folder, or None where there is none."""
+    """The manifest of a published folder, or None where there is none, or not as it was written."""
     try:
-        manifest = json.loads((target / MANIFEST).read_text(encoding="utf-8"))
+        text = (target / MANIFEST).read_text(encoding="utf-8")
+        manifest = json.loads(text)
     except (OSError, ValueError):
         return None
-    whole = isinstance(manifest, dict) and isinstance(manifest.get("outputs"), dict)
-    return manifest if whole else None
+    return manifest if isinstance(manifest, dict) and text == _sealed(manifest) else None
 
 
 def damaged(target: Path) -> list[str]:
-    """What is wrong with a published folder: files missing or changed since; empty where all is well."""
+    """What is wrong with a published folder: files missing, added or changed since; empty where all is well."""
     manifest = read_manifest(target)
     if manifest is None:
-        return [f"{target / MANIFEST} is missing or not a manifest"]
+        return [f"{target / MANIFEST} is missing, or has changed since it was published"]
     problems = []
     for name, entry in manifest["outputs"].items():
         path = target / name
@@ -153,7 +166,22 @@ def damaged(target: Path) -> list[str]:
             problems.append(f"{path} is missing")
         elif sha256(path) != entry["sha256"]:
             problems.append(f"{path} has changed since it was published")
+    known = {MANIFEST, *manifest["outputs"]}
+    problems += [f"{path} was not published" for path in sorted(target.iterdir()) if path.name not in known]
     return problems
+
+
+def published(folder: Path) -> list[Path]:
+    """The published folders under a folder, itself included; not what is hidden until it is whole."""
+    found = (path.parent for path in folder.glob(f"**/{MANIFEST}"))
+    return sorted(path for path in found if not any(map(UNFINISHED.fullmatch, path.relative_to(folder).parts)))
+
+
+def _sealed(manifest: Mapping[str, Any]) -> str:
+    """The text of a manifest, which ends in a hash of all that stands before."""
+    content = {name: value for name, value in manifest.items() if name != SEAL}
+    digest = hashlib.sha256(json.dumps(content, indent=1).encode()).hexdigest()
+    return json.dumps({**content, SEAL: digest}, indent=1) + "\n"
 
 
 def _flush(path: Path) -> None:

@@ -5,10 +5,9 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 
-from tscorr import publish
 from tscorr.batch.outcome import SceneOutcome, SceneProgress
 from tscorr.errors import TscorrError
-from tscorr.scene.correct import correct_scene, resume_key, target_of
+from tscorr.scene.correct import correct_scene, is_current, target_of
 from tscorr.scene.plan import Scene
 
 log = logging.getLogger("tscorr")
@@ -19,7 +18,7 @@ def outcomes(planned: Sequence[Scene], overwrite: bool, progress: SceneProgress)
     for scene in planned:
         target = target_of(scene)
         try:
-            if not overwrite and publish.is_current(target, resume_key(scene)):
+            if not overwrite and is_current(scene):
                 report = json.loads((target / "report.json").read_text(encoding="utf-8"))
                 log.info("scene '%s' is current", scene.name)
                 yield SceneOutcome(scene.name, "current", target, report=report)

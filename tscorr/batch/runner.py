@@ -35,7 +35,7 @@ def run(
         settings = config.load_config(settings)
     if workers is not None:
         settings = settings.model_copy(update={"run": settings.run.model_copy(update={"workers": workers})})
-    planned = plan(settings, scenes, materials)
+    planned = plan(settings, scenes, materials, to_run=True, overwrite=overwrite)
     folder = Path(settings.output.directory)
     with locked(folder), _log_file(folder):
         for deed in publish.recover(folder):

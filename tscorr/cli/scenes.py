@@ -101,7 +101,7 @@ def plan(config: Path, as_json: bool) -> None:
     from tscorr.config import load_config
     from tscorr.scene.forecast import forecast
 
-    forecasts = [forecast(scene) for scene in batch.plan(load_config(config))]
+    forecasts = [forecast(scene) for scene in batch.plan(load_config(config), to_run=True)]
     if as_json:
         click.echo(json.dumps({"scenes": forecasts}, indent=1))
         return
@@ -145,11 +145,11 @@ def verify(folder: Path) -> None:
     """Hash the published results under FOLDER again and compare them with their manifests."""
     from tscorr import publish
 
-    manifests = sorted(folder.glob(f"**/{publish.MANIFEST}"))
-    if not manifests:
+    results = publish.published(folder)
+    if not results:
         raise TscorrError(f"{folder} holds no {publish.MANIFEST}: nothing was published there")
-    problems = [problem for path in manifests for problem in publish.damaged(path.parent)]
+    problems = [problem for result in results for problem in publish.damaged(result)]
     for problem in problems:
         click.echo(problem)
-    click.echo(f"{len(manifests)} results, {len(problems)} problems")
+    click.echo(f"{len(results)} results, {len(problems)} problems")
     sys.exit(1 if problems else 0)

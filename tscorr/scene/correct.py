@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from tscorr import __version__, publish, rasters, stac
 from tscorr.angles import relative_azimuth, true_azimuth, zenith_azimuth
+from tscorr.errors import InputError
 from tscorr.grid import Block, Grid, longitude_latitude
 from tscorr.report import SceneFacts, page, summary, write_json
 from tscorr.scene.pictures import PICTURE_PX, draw_quicklook
@@ -40,12 +42,39 @@ def settings_of(scene: Scene) -> dict[str, Any]:
 
 
 def resume_key(scene: Scene) -> str:
-    """Digest of all that a scene's result depends on: settings, inputs, materials and version, not the machine."""
+    """Digest of all that a scene's values depend on: settings, inputs, materials and version, not the machine.
+
+    Which of the products were written is not in it: the manifest lists them.
+    """
     settings = settings_of(scene)
-    settings.pop("run")
-    settings.pop("title")
-    materials = [repr((surface, rules)) for surface, _, rules in scene.materials]
-    return publish.key({"settings": settings, "materials": materials}, scene.inputs, __version__)
+    for name in ("run", "title"):
+        settings.pop(name)
+    for name in ("products", "quicklook"):
+        settings["output"].pop(name)
+    settings["materials"].pop("library")  # what is used of it stands in the materials
+    materials = [repr((replace(surface, file=""), rules)) for surface, _, rules in scene.materials]
+    headers = [repr(header) for header in scene.headers]
+    content = {"settings": settings, "materials": materials, "headers": headers}
+    return publish.key(content, scene.identities, __version__)
+
+
+def products_of(scene: Scene) -> list[str]:
+    """What a scene's result holds beside its report."""
+    output = scene.config.output
+    return [*output.products, *(["quicklook"] if output.quicklook else [])]
+
+
+def is_current(scene: Scene) -> bool:
+    """Whether the published result of a scene is what would be computed, or more."""
+    return publish.is_current(target_of(scene), resume_key(scene), products_of(scene))
+
+
+def check_unchanged(scene: Scene) -> None:
+    """Raise InputError where an input is another file than when the scene was planned."""
+    now = publish.identities(scene.watched)
+    for path, identity in scene.identities.items():
+        if now.get(path) != identity:
+            raise InputError(f"the input {path} has changed while the scene was computed; run again once it is whole")
 
 
 def target_of(scene: Scene) -> Path:
@@ -56,7 +85,7 @@ def target_of(scene: Scene) -> Path:
 def correct_scene(scene: Scene, progress: Progress = silent, key: str | None = None) -> dict[str, Any]:
     """Correct a scene and publish its folder; the content of its report.json.
 
-    key : the scene's resume key where the inputs are known by other paths; default: as of now, before they are read.
+    key : the scene's resume key where the inputs are known by other paths; default: as they were when it was planned.
     """
     started = time.perf_counter()
     key = key or resume_key(scene)
@@ -80,12 +109,16 @@ def finish(scene: Scene, publication: publish.Publication, sums: Sums, wall_s: f
     (folder / "report.html").write_text(page(report, facts, picture, widths), encoding="utf-8")
     write_json(stac_item(scene, folder, facts, report), folder / "item.json")
     (folder / "settings.toml").write_text(tomli_w.dumps(settings_of(scene)), encoding="utf-8")
+    hashes = {str(path): {"sha256": publish.sha256(path)} for path in scene.inputs}
+    check_unchanged(scene)
     publication.commit(
         {
             "scene": scene.name,
             "tscorr": __version__,
             "key": key,
-            "inputs": {str(path): {"sha256": publish.sha256(path)} for path in scene.inputs},
+            "materials": list(scene.only),
+            "products": products_of(scene),
+            "inputs": hashes,
         }
     )
     return report

@@ -1,17 +1,18 @@
 """What a scene would cost and skip: the content of `tscorr plan`."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tscorr import publish
 from tscorr.correction import Corrector, class_rows
-from tscorr.scene.correct import resume_key, target_of, view_samples
+from tscorr.scene.correct import is_current, view_samples
 from tscorr.scene.plan import Scene
-from tscorr.scene.run import units_of, workers_of
+from tscorr.scene.run import BASE_MB, pixel_bytes, units_of, work_bytes, workers_of
 
 PRODUCT_BYTES = {"flags": 2, "azimuthal_width": 4, "angles": 36}
-IMPORTS_MB = 220.0
+OVERVIEWS = 4 / 3
+"""size of a raster with its overviews, over that without"""
 
 
 def forecast(scene: Scene) -> dict[str, Any]:
@@ -27,10 +28,6 @@ def forecast(scene: Scene) -> dict[str, Any]:
             idle += not in_block[peaks].any()
     rows, cols = scene.image.shape
     total = rows * cols
-    image_bytes = scene.image.bands * scene.image.dtype.itemsize
-    per_pixel = sum(PRODUCT_BYTES.get(product, image_bytes) for product in scene.config.output.products)
-    largest = max(block.height * block.width for block in cut)
-    per_worker = largest * (2 * image_bytes + 60) / 1e6
     zenith, _ = view_samples(scene)
     zenith = zenith[np.isfinite(zenith)]
     return {
@@ -47,7 +44,40 @@ def forecast(scene: Scene) -> dict[str, Any]:
         "no_material": float(counts[0] / total),
         "blocks": len(cut),
         "blocks_no_specular_material": idle,
-        "disk_mb": total * per_pixel / 1e6,
-        "memory_mb": IMPORTS_MB + workers_of(scene) * per_worker,
-        "current": publish.is_current(target_of(scene), resume_key(scene)),
+        "disk_mb": disk_bytes(scene)[1] / 1e6,
+        "memory_mb": memory_mb(scene),
+        "current": is_current(scene),
     }
+
+
+def disk_bytes(scene: Scene) -> tuple[float, float]:
+    """Least and most that the rasters of a scene's result take on the disk, while they are written.
+
+    Least: the corrected image alone, as small as the image is where it keeps its codec. Most: nothing compresses.
+    """
+    image, output = scene.image, scene.config.output
+    pixels = image.shape[0] * image.shape[1]
+    image_bytes = pixels * pixel_bytes(image)
+    each = [pixels * PRODUCT_BYTES[p] if p in PRODUCT_BYTES else image_bytes for p in output.products]
+    most = sum(each) * OVERVIEWS + max(each, default=0) if output.format == "cog" else sum(each)
+    if "corrected" not in output.products:
+        return 0.0, most
+    codec = output.compression or image.profile["compress"]
+    least = image_bytes if codec == "none" else min(image_bytes, image.path.stat().st_size)
+    return (least if output.compression is None or codec == "none" else 0.0), most
+
+
+def memory_mb(scene: Scene) -> float:
+    """Memory that a scene takes, about: what does not grow with blocks, and a block for each worker."""
+    largest = max(block.height * block.width for block in units_of(scene))
+    return BASE_MB + workers_of(scene) * largest * work_bytes(scene.image) / 1e6
+
+
+def available_mb() -> float:
+    """Memory that the machine could give to a process now; infinite where it does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return float("inf")
+    kilobytes = {name: int(value.split()[0]) for name, value in (line.split(":") for line in lines)}
+    return (kilobytes["MemAvailable"] + kilobytes["SwapFree"]) / 1e3

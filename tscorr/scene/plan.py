@@ -1,16 +1,16 @@
 """What is known of a scene before its pixels are read: every input opened, checked and understood."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tscorr import config, rasters
+from tscorr import config, publish, rasters
 from tscorr.correction import NEGLIGIBLE_REFLECTANCE, Rules, Stored
-from tscorr.errors import ConfigError, InputError, MaterialError
+from tscorr.errors import ConfigError, InputError, MaterialError, TscorrError
 from tscorr.grid import Grid
 from tscorr.materials import BandParameters, Material, find
 from tscorr.scene.directions import Seen, close_all, obs_file, sun_of, view_of
@@ -18,6 +18,8 @@ from tscorr.sensor import View
 from tscorr.sun import Sun
 
 Array = NDArray[Any]
+P = ParamSpec("P")
+T = TypeVar("T")
 
 TALLY_PIXELS = 4e6
 """histograms are of every n-th row where an image has more pixels than this; counts are always of all"""
@@ -45,6 +47,10 @@ class Scene:
     wavelengths_um: tuple[float, ...] | None
     ground_level_m: float
     """middle height of the surface, from a coarse look"""
+    only: tuple[str, ...] = ()
+    """the materials that a run is restricted to; empty for all"""
+    identities: Mapping[str, Any] = field(default_factory=dict)
+    """size and time of each of the files watched, when the scene was planned"""
 
     @property
     def grid(self) -> Grid:
@@ -61,12 +67,33 @@ class Scene:
         close_all(self.seen.layers)
 
     @property
+    def _rasters(self) -> list[rasters.RasterInfo]:
+        infos = [self.image, self.class_map, *self.surface_files]
+        return infos if self.confidence is None else [*infos, self.confidence]
+
+    @property
+    def headers(self) -> list[tuple[Any, ...]]:
+        """What the headers of the rasters say of their values and their place, in whatever file they say it."""
+        return [
+            (info.grid, info.dtype, info.nodata, info.scales, info.offsets, info.names, info.wavelengths_um)
+            for info in self._rasters
+        ]
+
+    @property
+    def watched(self) -> list[Path]:
+        """Every file that the result's values depend on.
+
+        Not the libraries, of which the materials are known, nor what other programs write beside a raster when they
+        show it: the headers hold what matters of that.
+        """
+        shown = (".aux.xml", ".ovr")
+        libraries = {Path(path) for path in self.config.materials.library}
+        return [path for path in self.inputs if path not in libraries and not path.name.endswith(shown)]
+
+    @property
     def inputs(self) -> list[Path]:
         """Every file that the result depends on."""
-        infos = [self.image, self.class_map, *self.surface_files]
-        if self.confidence is not None:
-            infos.append(self.confidence)
-        files = [file for info in infos for file in info.files]
+        files = [file for info in self._rasters for file in info.files]
         if self.settings.truth is not None:
             files += [Path(self.settings.truth.diffuse), Path(self.settings.truth.sunlit)]
         return [*files, *self.seen.files, *map(Path, self.config.materials.library)]
@@ -96,34 +123,32 @@ def plan_scene(
 
     library : materials by name.
     only    : if given, the materials to correct; the others are treated as not enabled.
-    Raises ConfigError or InputError with the first thing that is wrong.
+    Raises ConfigError, MaterialError or InputError with all that is wrong, one thing a line.
     """
-    image = rasters.describe(settings.image)
-    if image.dtype.name not in rasters.IMAGE_TYPES:
-        allowed = ", ".join(rasters.IMAGE_TYPES)
-        raise InputError(f"the image {image.path} holds {image.dtype} values; allowed are {allowed}")
-    class_map = _class_map(settings, whole, image)
-    confidence = None
-    if settings.class_confidence is not None:
-        confidence = _single_band(settings.class_confidence, image, "the class confidence")
-    _check_truth(settings.truth, image)
-    stored = _stored(settings, image)
+    image = _image(settings)
+    checks = Checks()
+    class_map = checks(_class_map, settings, whole, image)
+    confidence = checks(_confidence, settings, image)
+    checks(_check_truth, settings.truth, image)
+    stored = checks(_stored, settings, image)
+    wavelengths = checks(_wavelengths, settings, image)
+    seen = checks(view_of, settings.view, image)
+    surface_files = checks(_surface_files, settings.surface, image)
+    checks.settle()
     names = list(dict.fromkeys(whole.materials.classes.values()))
-    wavelengths = _wavelengths(settings, image)
     materials = tuple(
         (
             find(name, library),
-            _at_bands(find(name, library), wavelengths, image),
-            rules_of(name, settings, whole, stored, image, only),
+            checks(_at_bands, find(name, library), wavelengths, image),
+            checks(rules_of, name, settings, whole, stored, image, only),
         )
         for name in names
     )
-    seen = view_of(settings.view, image)
-    surface_files = tuple(_surface_files(settings.surface, image))
-    ground_level, highest = _heights(settings.surface, surface_files)
-    seen.view.check(image.grid, highest)
-    sun = sun_of(settings.sun, seen, image, ground_level)
-    return Scene(
+    ground_level, highest = checks(_heights, settings.surface, surface_files) or (0.0, 0.0)
+    checks(seen.view.check, image.grid, highest)
+    sun = checks(sun_of, settings.sun, seen, image, ground_level)
+    checks.settle()
+    scene = Scene(
         name=settings.name or image.path.stem,
         settings=settings,
         config=whole,
@@ -138,7 +163,54 @@ def plan_scene(
         surface_files=surface_files,
         wavelengths_um=wavelengths,
         ground_level_m=ground_level,
+        only=tuple(only),
     )
+    return replace(scene, identities=publish.identities(scene.watched))
+
+
+class Checks:
+    """Checks that do not need each other: all are made before what they found is raised."""
+
+    def __init__(self) -> None:
+        self._errors: list[TscorrError] = []
+
+    def __call__(self, check: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """What a check returns; where it fails None, which nobody sees: `settle` comes first."""
+        try:
+            return check(*args, **kwargs)
+        except TscorrError as error:
+            self._errors.append(error)
+            return cast("T", None)
+
+    def settle(self) -> None:
+        """Raise what was found, if anything was."""
+        if self._errors:
+            kinds = {type(error) for error in self._errors}
+            kind = kinds.pop() if len(kinds) == 1 else InputError
+            raise kind("\n".join(dict.fromkeys(map(str, self._errors))))
+
+
+def _image(settings: config.Scene) -> rasters.RasterInfo:
+    image = rasters.describe(settings.image)
+    if image.dtype.name not in rasters.IMAGE_TYPES:
+        allowed = ", ".join(rasters.IMAGE_TYPES)
+        raise InputError(f"the image {image.path} holds {image.dtype} values; allowed are {allowed}")
+    return image
+
+
+def _confidence(settings: config.Scene, image: rasters.RasterInfo) -> rasters.RasterInfo | None:
+    """The raster of class confidence, if there is one; a coarse look tells per cent from shares."""
+    if settings.class_confidence is None:
+        return None
+    confidence = _single_band(settings.class_confidence, image, "the class confidence")
+    shares = rasters.read_decimated(confidence, 256) * confidence.scales[0] + confidence.offsets[0]
+    shares = shares[np.isfinite(shares)]
+    if shares.size and not (shares.min() >= 0 and shares.max() <= 1 + 1e-6):
+        raise InputError(
+            f"the class confidence {confidence.path} holds values from {shares.min():.6g} to {shares.max():.6g}; "
+            f"allowed are 0 to 1, after the scale of the file"
+        )
+    return confidence
 
 
 def _class_map(settings: config.Scene, whole: config.Config, image: rasters.RasterInfo) -> rasters.RasterInfo:
@@ -171,13 +243,16 @@ def _single_band(path: str, image: rasters.RasterInfo, what: str) -> rasters.Ras
 
 
 def _check_truth(truth: config.Truth | None, image: rasters.RasterInfo) -> None:
-    """The rasters of the truth must have the pixels of the image."""
+    """The rasters of the truth must have the pixels of the image, and its bands."""
     if truth is None:
         return
-    for path in (truth.diffuse, truth.sunlit):
+    for path, bands in ((truth.diffuse, image.bands), (truth.sunlit, 1)):
         info = rasters.describe(path)
-        if info.shape != image.shape:
-            raise InputError(f"the truth {info.path} has the shape {info.shape}; the image has {image.shape}")
+        if (info.bands, *info.shape) != (bands, *image.shape):
+            raise InputError(
+                f"the truth {info.path} has {info.bands} bands of {info.shape}; allowed are {bands} of {image.shape}, "
+                f"as the image has them"
+            )
 
 
 def _at_bands(surface: Material, wavelengths: tuple[float, ...] | None, image: rasters.RasterInfo) -> BandParameters:
@@ -268,8 +343,12 @@ def rules_of(
     )
 
 
-def _surface_files(settings: Any, image: rasters.RasterInfo) -> Iterator[rasters.RasterInfo]:
+def _surface_files(settings: Any, image: rasters.RasterInfo) -> tuple[rasters.RasterInfo, ...]:
     """The rasters of a surface, checked: heights first if there are any."""
+    return tuple(_each_surface_file(settings, image))
+
+
+def _each_surface_file(settings: Any, image: rasters.RasterInfo) -> Iterator[rasters.RasterInfo]:
     if isinstance(settings, config.FlatSettings):
         return
     heights = settings.path if isinstance(settings, config.DsmSettings) else settings.heights

@@ -43,10 +43,12 @@ def silent(pixels: int) -> None:
 
 UNIT_COLUMNS = 2048
 STRIPE_COLUMNS = 8192
-BASE_MB = 300
+BASE_MB = 220
 """memory of the process before the first block, and of what does not grow with blocks"""
 COPIES = 5
 """an image block and what is made of it, at most, in blocks of the image's own size"""
+GEOMETRY_BYTES = 60
+"""vectors, angles and masks of a pixel"""
 MOST_WORKERS = 4
 LEAST_CONFIDENCE = 0.5
 ANGLE_NAMES = (
@@ -105,6 +107,16 @@ class Sums:
                 self.seconds[part] += time.perf_counter() - start
 
 
+def pixel_bytes(image: rasters.RasterInfo) -> int:
+    """Bytes of a pixel of the image, all bands."""
+    return image.bands * image.dtype.itemsize
+
+
+def work_bytes(image: rasters.RasterInfo) -> int:
+    """Memory that the work on a pixel takes at most."""
+    return COPIES * pixel_bytes(image) + GEOMETRY_BYTES
+
+
 def units(image: rasters.RasterInfo, memory_limit_mb: int, workers: int) -> list[Block]:
     """Blocks that the work is cut into: whole tiles of the rasters that are written, stripe by stripe.
 
@@ -112,11 +124,10 @@ def units(image: rasters.RasterInfo, memory_limit_mb: int, workers: int) -> list
     """
     rows, cols = image.shape
     tile_rows, tile_cols = image.written_tile
-    pixel_bytes = image.bands * image.dtype.itemsize
-    width = cols if tile_cols >= cols else max(1, UNIT_COLUMNS // tile_cols) * tile_cols
-    unit_bytes = max(1e6, (memory_limit_mb - BASE_MB) * 1e6 / (workers * COPIES))
-    room = int(unit_bytes / pixel_bytes / min(width, cols))
-    height = max(1, min(room, 512) // tile_rows) * tile_rows
+    room = (memory_limit_mb - BASE_MB) * 1e6 / workers / work_bytes(image)  # pixels
+    widest = cols if tile_cols >= cols else max(1, UNIT_COLUMNS // tile_cols) * tile_cols
+    width = min(widest, max(1, int(room / tile_rows / tile_cols)) * tile_cols)
+    height = max(1, min(int(room / min(width, cols)), 512) // tile_rows) * tile_rows
     stripe = max(width, STRIPE_COLUMNS // width * width)
     return [
         Block(block.row, first + block.col, block.height, block.width)
@@ -327,8 +338,12 @@ FLAG_TAGS = {f"FLAG_BIT_{flag.value.bit_length() - 1}": str(flag.name) for flag 
 
 
 def workers_of(scene: Scene) -> int:
-    """Threads that work on blocks: as configured, or all cores up to a few."""
-    return scene.config.run.workers or min(MOST_WORKERS, len(os.sched_getaffinity(0)))
+    """Threads that work on blocks: as configured, or all cores up to a few; no more than the memory limit feeds."""
+    run = scene.config.run
+    wanted = run.workers or min(MOST_WORKERS, len(os.sched_getaffinity(0)))
+    rows, cols = map(min, scene.image.tile, scene.image.shape)
+    tile_mb = rows * cols * work_bytes(scene.image) / 1e6
+    return max(1, min(wanted, int((run.memory_limit_mb - BASE_MB) / tile_mb)))
 
 
 def run_all(work: Callable[[Block], int], todo: list[Block], workers: int, progress: Progress) -> None:

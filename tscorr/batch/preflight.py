@@ -1,0 +1,102 @@
+"""What the machine must have for a batch, looked at before any work starts."""
+
+import logging
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from tscorr import config, publish
+from tscorr.errors import ConfigError, OutputError, TscorrError
+from tscorr.scene.correct import is_current, target_of
+from tscorr.scene.forecast import available_mb, disk_bytes, memory_mb
+from tscorr.scene.plan import Scene
+
+log = logging.getLogger("tscorr")
+
+
+def preflight(settings: config.Config, planned: Sequence[Scene], *, overwrite: bool) -> Iterator[TscorrError]:
+    """Every reason why these scenes could not be computed and written here, as errors to be raised."""
+    todo = [scene for scene in planned if overwrite or not is_current(scene)]
+    if not overwrite:
+        yield from _partial(todo)
+    yield from _memory(todo)
+    folder = Path(settings.output.directory)
+    try:
+        existing = _writable(folder)
+    except ConfigError as error:
+        yield error
+    else:
+        yield from _disk(todo, existing)
+
+
+def _partial(todo: Sequence[Scene]) -> Iterator[TscorrError]:
+    """Results of some materials must not take the place of whole ones unasked."""
+    for scene in todo:
+        manifest = publish.read_manifest(target_of(scene))
+        if scene.only and manifest is not None and not manifest.get("materials"):
+            yield ConfigError(
+                f"scene '{scene.name}': {target_of(scene)} holds the result of all materials; a run with --material "
+                f"would take its place: give another [output] directory, or --overwrite"
+            )
+
+
+def _memory(todo: Sequence[Scene]) -> Iterator[TscorrError]:
+    """The limit must hold the smallest block of each image, and the machine the limit."""
+    free_mb = available_mb()
+    for scene in todo:
+        need_mb, limit_mb = memory_mb(scene), scene.config.run.memory_limit_mb
+        if need_mb > limit_mb:
+            rows, cols = scene.image.tile
+            yield ConfigError(
+                f"scene '{scene.name}' takes about {need_mb:.0f} MB of memory, since the image {scene.image.path} is "
+                f"stored in blocks of {rows} x {cols} pixels; [run] memory_limit_mb = {limit_mb}: allow more, or "
+                f"store it in smaller tiles"
+            )
+        elif need_mb > free_mb:
+            yield OutputError(
+                f"scene '{scene.name}' takes at least {need_mb:.0f} MB of memory; {free_mb:.0f} MB are available"
+            )
+
+
+def _writable(folder: Path) -> Path:
+    """What exists of the way to the output folder; ConfigError where nothing can be written there."""
+    existing = folder
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    said = f"[output] directory = {folder}: {existing}"
+    if not existing.is_dir():
+        raise ConfigError(f"{said} is not a folder; allowed is a folder that can be made")
+    try:
+        with tempfile.TemporaryFile(dir=existing):  # asking for permissions does not tell: root has them all
+            return existing
+    except OSError as error:
+        raise ConfigError(
+            f"{said} cannot be written: {error.strerror}; allowed is a folder that can be made"
+        ) from None
+
+
+def _disk(todo: Sequence[Scene], folder: Path) -> Iterator[TscorrError]:
+    """The results must fit on the disk, each beside the one that it replaces until that is deleted."""
+    free = shutil.disk_usage(folder).free
+    least, most = (_peak(todo, which) for which in (0, 1))
+    if least > free:
+        yield OutputError(
+            f"the results need {least / 1e6:.0f} MB on the disk of {folder}, or {most / 1e6:.0f} MB where they do not "
+            f"compress; {free / 1e6:.0f} MB are free"
+        )
+    elif most > free:
+        log.warning(
+            "the results may need up to %.0f MB on the disk of %s; %.0f MB are free", most / 1e6, folder, free / 1e6
+        )
+
+
+def _peak(todo: Sequence[Scene], which: int) -> float:
+    """Most bytes in use above those of now, while the scenes are written one after the other."""
+    used = peak = 0.0
+    for scene in todo:
+        used += disk_bytes(scene)[which]
+        peak = max(peak, used)
+        old = publish.read_manifest(target_of(scene))
+        used -= 0 if old is None else sum(entry["bytes"] for entry in old["outputs"].values())
+    return peak
