@@ -5,11 +5,13 @@ GDAL never applies scale and offset; neither does anything here: blocks hold sto
 
 from tscorr.rasters.header import IMAGE_TYPES, RasterInfo, can_hold, check_metric, check_overlap, describe, opened
 from tscorr.rasters.joining import join_rows, result
+from tscorr.rasters.kept import KeptReader
 from tscorr.rasters.reading import Reader, read_decimated, read_decimated_flags
 from tscorr.rasters.writing import Layer, Writer, make_cog
 
 __all__ = [
     "IMAGE_TYPES",
+    "KeptReader",
     "Layer",
     "RasterInfo",
     "Reader",

@@ -47,7 +47,10 @@ class Reader:
         self._margin = margin
         shift = _pixel_shift(info.grid, self._grid)
         self._aligned = shift is not None
-        self._shift = shift if shift is not None else (margin, margin)
+        self.shift = shift if shift is not None else (margin, margin)
+        """rows and columns from the first pixel that is stored to the first of the grid"""
+        self.tile = info.tile if self._aligned else (1, 1)
+        """(rows, cols) that are decoded together"""
         self._local = threading.local()
         self._handles: list[Any] = []
         self._lock = threading.Lock()
@@ -64,7 +67,7 @@ class Reader:
 
     def _read(self, block: Block, bands: int | None) -> Array:
         dataset = self._dataset()
-        row, col = block.row + self._shift[0], block.col + self._shift[1]
+        row, col = block.row + self.shift[0], block.col + self.shift[1]
         top, left = max(row, 0), max(col, 0)
         bottom, right = min(row + block.height, dataset.height), min(col + block.width, dataset.width)
         inside = Block(top, left, bottom - top, right - left)

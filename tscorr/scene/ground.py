@@ -40,6 +40,7 @@ class Ground:
         self._scene = scene
         self._files = ExitStack()
         self._heights = self._heights_reader()
+        self._shared = rasters.KeptReader(self._heights) if self._heights is not None else None
         self._level_m, self._relief_m, self._noise_m = self._survey()
         self.surface: Surface = self._surface()
         self._lit: BitMask | None = None
@@ -61,8 +62,14 @@ class Ground:
         return self._files.enter_context(reader)
 
     def _read_heights(self, block: Block) -> Array:
+        """Heights of a block that is read once, whatever its size."""
         assert self._heights is not None
         return self._heights.read(block, 1)
+
+    def _shared_heights(self, block: Block) -> Array:
+        """Heights of a block whose surroundings are read for other blocks too."""
+        assert self._shared is not None
+        return self._shared.read(block)
 
     def _survey(self) -> tuple[float, float, float]:
         """Middle height, relief and noise of the surface, from windows spread over the scene. [m]"""
@@ -95,11 +102,11 @@ class Ground:
         level = self._level_m
         if isinstance(settings, config.DsmSettings) and settings.kind == "roof_planes":
             return RoofPlaneSurface(
-                self._read_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level, noise_m=self._noise_m
+                self._shared_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level, noise_m=self._noise_m
             )
         dsm: Surface = FlatSurface(0.0)
         if self._heights is not None:
-            dsm = DsmSurface(self._read_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level)
+            dsm = DsmSurface(self._shared_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level)
         if isinstance(settings, config.DsmSettings):
             return dsm
         info = self._scene.surface_files[-1]
@@ -221,5 +228,5 @@ class Ground:
         reach = shadows.reach_m(self._relief_m, min(zenith, 80.0)) / min(cell_x_m, cell_y_m)
         halo = min(MARGIN_PX, int(np.ceil(reach)) + 1)
         window = slice(halo, halo + block.height), slice(halo, halo + block.width)
-        heights = self._read_heights(block.padded(halo))
+        heights = self._shared_heights(block.padded(halo))
         return shadows.march(heights, view, cell_x_m=cell_x_m, cell_y_m=cell_y_m, window=window, needed=needed)

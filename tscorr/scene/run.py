@@ -83,7 +83,9 @@ class Sums:
 
     def add(self, result: BlockResult, kind: str | None) -> None:
         """Add a block; `kind` says why most of its work was skipped, if it was."""
-        counts = np.bincount(result.flags.ravel(), minlength=1 << 16)
+        from tscorr.scene.compiled import counts_of
+
+        counts = counts_of(result.flags)
         with self._lock:
             add_tally(self.tally, result.tally)
             self.flags += counts

@@ -1,4 +1,4 @@
-"""The two loops over pixels that numpy is slow at: when a scanner passed, and vectors between raster pixels.
+"""Loops over pixels that numpy is slow at: towards a camera, when a scanner passed, vectors between raster pixels.
 
 Each result depends on its own pixel only, so it is the same however a scene is cut into blocks.
 """
@@ -10,6 +10,36 @@ from numba import njit
 
 TILE = 16
 """pixels of a side of the tiles for which the possible samples are listed"""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def towards(position, heights, transform, first_row, first_col, shape):
+    """Unit vectors (3, rows, cols) from the pixels of a block to one position.
+
+    position  : (3,). heights : (rows, cols), or (1, 1) where constant. [m]
+    transform : (6,), of the grid: x = t[0] (col + 1/2) + t[1] (row + 1/2) + t[2], y with t[3:].
+    shape     : (rows, cols), whose first pixel is (first_row, first_col) of the grid.
+    """
+    rows, cols = shape
+    vectors = np.empty((3, rows, cols))
+    constant = heights.size == 1
+    for i in range(rows):
+        row = first_row + i + 0.5
+        east, north, up = vectors[0, i], vectors[1, i], vectors[2, i]
+        below = heights[0 if constant else i]
+        for j in range(cols):
+            up[j] = position[2] - below[0 if constant else j]
+        for j in range(cols):
+            col = first_col + j + 0.5
+            x, y = (
+                position[0] - (transform[0] * col + transform[1] * row + transform[2]),
+                position[1] - (transform[3] * col + transform[4] * row + transform[5]),
+            )
+            inverse = 1.0 / math.sqrt(x * x + y * y + up[j] * up[j])
+            east[j] = x * inverse
+            north[j] = y * inverse
+            up[j] *= inverse
+    return vectors
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -80,8 +80,10 @@ class FrameView(View):
 
     def look(self, grid: Grid, block: Block, heights: Array) -> Look:
         """Vectors (3, rows, cols) from the surface to the projection centre."""
-        x, y = ground(grid, block)
-        return Look(unit(self.position[0] - x, self.position[1] - y, self.position[2] - heights))
+        from tscorr.sensor.compiled import towards
+
+        transform, position = np.array(grid.transform[:6]), np.array(self.position)
+        return Look(towards(position, np.ascontiguousarray(heights), transform, block.row, block.col, block.shape))
 
     def check(self, grid: Grid, highest_m: float) -> None:
         """The camera must be above the highest point of the scene, and not beyond its horizon."""

@@ -68,7 +68,7 @@ class DsmSurface:
         halo = HORN_HALO_PX
         result = horn_normals(self._read(block.padded(halo)), **self._cell)
         inner = (slice(halo, -halo), slice(halo, -halo))
-        return np.ascontiguousarray(result.normals[:, *inner]), result.unreliable[inner]
+        return result.normals[:, *inner], result.unreliable[inner]
 
 
 class RoofPlaneSurface:
