@@ -8,6 +8,7 @@ come. Images are expected decimated; `linear_rgb` takes bands one by one, so a r
 """
 
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -176,6 +177,12 @@ def flag_classes(flags: NDArray[np.uint16]) -> NDArray[np.uint8]:
     }
     index = list(FLAG_COLOURS).index
     return np.select(list(reasons.values()), [index(name) for name in reasons], 0).astype(np.uint8)
+
+
+@cache
+def flag_palette() -> NDArray[np.uint8]:
+    """Red, green and blue of each value of `flags.tif`: (65536, 3)."""
+    return np.array(list(FLAG_COLOURS.values()), np.uint8)[flag_classes(np.arange(1 << 16, dtype=np.uint16))]
 
 
 def flag_panel(flags: NDArray[np.uint16], before: Array, exposure: float) -> Array:

@@ -46,7 +46,9 @@ RASTERS = {
 }
 """title and roles"""
 TIFF_TIME = "TIFFTAG_DATETIME"
-TIFF, VRT = "image/tiff; application=geotiff", "application/xml"
+TIFF = "image/tiff; application=geotiff"
+MEDIA = {".tif": TIFF, ".vrt": "application/xml", ".dat": "application/octet-stream", ".hdr": "text/plain"}
+"""by the end of a raster's name; .dat and .hdr are an ENVI file and its header"""
 DOCUMENTS = {
     "quicklook": ("quicklook.png", "image/png", "before, after and flags", "overview"),
     "report_json": ("report.json", "application/json", "report, for programs", "metadata"),
@@ -88,6 +90,7 @@ def item(
     version: str,
     quicklook: bool = True,
     strips: Sequence[str] = (),
+    cloud_optimised: bool = False,
 ) -> Json:
     """The STAC item of one scene's folder.
 
@@ -97,6 +100,7 @@ def item(
     view_*    : for the whole scene, of surface -> sensor from the vertical and true north; nan if unknown.
     report    : content of report.json.
     quicklook : whether quicklook.png was drawn.
+    cloud_optimised : whether the GeoTIFFs are.
     strips    : names of the files that hold the pixels of `files`, where those are VRTs.
 
     A scene across the 180th meridian is not cut there. OSError where the image has no time and is gone.
@@ -111,6 +115,12 @@ def item(
         **_view(solar_zenith_deg, solar_azimuth_deg, view_zenith_deg, view_azimuth_deg),
     }
     assets = {key: _raster(key, info, bands, report) for key, info in files.items()}
+    for key, info in files.items():
+        if cloud_optimised and info.path.suffix == ".tif":
+            assets[key]["type"] = f"{TIFF}; profile=cloud-optimized"
+        if info.path.suffix == ".dat":
+            header = info.path.with_suffix(".hdr").name
+            assets[f"{key}_header"] = _asset(header, MEDIA[".hdr"], f"header of {info.path.name}", "metadata")
     assets |= {Path(name).stem: _asset(name, TIFF, f"strip of {name.split('.')[0]}", "data") for name in strips}
     assets |= {key: _asset(*entry) for key, entry in DOCUMENTS.items() if quicklook or key != "quicklook"}
     folder = next((info.path.parent for info in files.values()), None)
@@ -223,7 +233,7 @@ def _raster(key: str, info: "RasterInfo", bands: Bands, report: Mapping[str, Any
     unit = "degree" if key in {"azimuthal_width", "angles"} else None
     common = {"data_type": info.dtype.name, "nodata": nodata, "unit": unit}
     scaling = zip(info.scales, info.offsets, strict=True)
-    asset = _asset(info.path.name, VRT if info.path.suffix == ".vrt" else TIFF, *RASTERS[key])
+    asset = _asset(info.path.name, MEDIA[info.path.suffix], *RASTERS[key])
     asset["bands"] = [{"name": name} for name in info.names]
     asset["raster:bands"] = [_known(**common, scale=scale, offset=offset) for scale, offset in scaling]
     if key in {"corrected", "removed", "uncertainty"}:

@@ -79,6 +79,8 @@ def print_outcome(result: "BatchResult") -> None:
                 f"(RMS of reflectance against the truth)"
                 + (f": {residual['ratio']:.3f} of it is left" if residual["ratio"] is not None else "")
             )
+        if bad := scene.report.get("bad_bands"):
+            notes.append(f"{scene.name}: {left_alone(bad)}")
         if scene.state == "current":
             notes.append(f"{scene.name}: nothing to do, the result is current")
     print_table(rows)
@@ -87,6 +89,12 @@ def print_outcome(result: "BatchResult") -> None:
     here = Path.cwd()
     folder = result.folder.relative_to(here) if result.folder.is_relative_to(here) else result.folder
     click.echo(f"results: {folder}")
+
+
+def left_alone(bad: Sequence[str]) -> str:
+    """What is said of bands that the image marks as bad."""
+    listed = ", ".join(bad) if len(bad) <= 4 else f"{', '.join(bad[:3])}, ..."
+    return f"{len(bad)} bad {'band' if len(bad) == 1 else 'bands'} left as in the image: {listed}"
 
 
 @click.command()
@@ -112,6 +120,8 @@ def plan(config: Path, as_json: bool) -> None:
         click.echo(f"  view zenith {low:.1f} to {high:.1f}, median {middle:.1f} degrees")
         for name, share in entry["materials"].items():
             click.echo(f"  {name}: {100 * share:.1f} % of the pixels")
+        if entry["bad_bands"]:
+            click.echo(f"  {left_alone(entry['bad_bands'])}")
         click.echo(f"  no material: {100 * entry['no_material']:.1f} % of the pixels")
         skipped = f"{entry['blocks_no_specular_material']} of {entry['blocks']} blocks have nothing to correct"
         click.echo(

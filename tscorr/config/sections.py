@@ -41,7 +41,9 @@ class Output(Section):
 
     directory: str = Field("out", description="folder for the results, relative to this file")
     products: list[Product] = Field(["corrected", "flags", "removed"], description="rasters to write")
-    format: Literal["gtiff", "cog"] = Field("gtiff", description="tiled GeoTIFF, or cloud-optimised with overviews")
+    format: Literal["gtiff", "cog", "envi"] = Field(
+        "gtiff", description="GeoTIFF laid out as the image, cloud-optimised GeoTIFF, or ENVI (.dat and .hdr)"
+    )
     compression: Literal["none", "deflate", "zstd", "lzw"] | None = Field(
         None, description="codec of the results; default: the input's"
     )

@@ -3,6 +3,7 @@
 GDAL never applies scale and offset; neither does anything here: blocks hold stored values.
 """
 
+from tscorr.rasters.envi_writing import ENVI_SUFFIX, EnviWriter
 from tscorr.rasters.header import IMAGE_TYPES, RasterInfo, can_hold, check_metric, check_overlap, describe, opened
 from tscorr.rasters.joining import join_rows, result
 from tscorr.rasters.kept import KeptReader
@@ -10,7 +11,9 @@ from tscorr.rasters.reading import Reader, read_decimated, read_decimated_flags
 from tscorr.rasters.writing import Layer, Writer, make_cog
 
 __all__ = [
+    "ENVI_SUFFIX",
     "IMAGE_TYPES",
+    "EnviWriter",
     "KeptReader",
     "Layer",
     "RasterInfo",

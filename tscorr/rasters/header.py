@@ -1,8 +1,8 @@
 """What the header of a raster says, checked before a pixel is read."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,13 @@ from rasterio.warp import transform_bounds
 
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
+from tscorr.rasters import envi
+from tscorr.rasters.envi import PixelByPixel
 from tscorr.rasters.sound import check_sound, open_dataset
 
 IMAGE_TYPES = ("uint8", "int16", "uint16", "float32")
+TILE_BYTES = 8e6
+"""what is stored together in new files at most"""
 ENVIRONMENT = {"GDAL_CACHEMAX": 64, "GDAL_NUM_THREADS": "1", "GDAL_VRT_ENABLE_PYTHON": "NO"}
 
 
@@ -42,6 +46,10 @@ class RasterInfo:
     band_tags: tuple[dict[str, dict[str, str]], ...]
     """for each band, tags by domain ('' and 'IMAGERY')"""
     colors: tuple[ColorInterp, ...] = ()
+    bad_bands: tuple[bool, ...] = ()
+    """which bands the header marks as bad; empty where it marks none"""
+    envi: Mapping[str, str] = field(default_factory=dict)
+    """the header of an ENVI file, as GDAL gives it"""
     files: tuple[Path, ...] = ()
     """the raster, and what GDAL reads beside it: header, overviews, mask, world file"""
     ours: bool = False
@@ -51,6 +59,11 @@ class RasterInfo:
     def shape(self) -> tuple[int, int]:
         """(rows, cols)."""
         return self.grid.shape
+
+    @property
+    def pixel_by_pixel(self) -> PixelByPixel | None:
+        """How to read an ENVI file that holds all bands of a pixel together; None for any other."""
+        return PixelByPixel.of(self.path, self.envi, self.dtype, (*self.shape, self.bands))
 
     def crop(self, block: Block) -> "RasterInfo":
         """The header that a raster of one block of this one has."""
@@ -87,23 +100,26 @@ def describe(path: str | Path, *, ours: bool = False) -> RasterInfo:
         check_sound(dataset, path)
         dtype = np.dtype(dataset.dtypes[0])
         rows, cols = dataset.block_shapes[0]
-        wavelengths, widths = _wavelengths(dataset)
+        fields = dataset.tags(ns="ENVI") if dataset.driver == "ENVI" else {}
+        wavelengths, widths = _wavelengths(dataset, fields)
         return RasterInfo(
             path=path,
             grid=Grid(dataset.crs, dataset.transform, dataset.shape),
             bands=dataset.count,
             dtype=dtype,
             nodata=dataset.nodata if can_hold(dtype, dataset.nodata) else None,
-            scales=tuple(dataset.scales),
+            scales=_scales(dataset, fields),
             offsets=tuple(dataset.offsets),
-            names=tuple(name or f"band {i + 1}" for i, name in enumerate(dataset.descriptions)),
+            names=_names(dataset, fields),
             wavelengths_um=wavelengths,
             fwhm_um=widths,
             tile=(rows, cols),
             profile=_profile(dataset),
             tags=dataset.tags(),
-            band_tags=tuple({ns: dataset.tags(i, ns=ns) for ns in ("", "IMAGERY")} for i in dataset.indexes),
+            band_tags=_band_tags(dataset, wavelengths if fields else None, widths if fields else None),
             colors=tuple(dataset.colorinterp),
+            bad_bands=envi.bad_bands(fields, dataset.count),
+            envi=fields,
             files=(path, *(Path(file) for file in dataset.files[1:])),
             ours=ours,
         )
@@ -118,13 +134,21 @@ def can_hold(dtype: np.dtype[Any], value: float | None) -> bool:
     return not np.isfinite(value) or abs(value) <= float(np.finfo(dtype).max)
 
 
+def tile_side(pixel_bytes: int) -> int:
+    """Side of a square tile whose pixels are so large: 512, or less where many bands stand together."""
+    side = int((TILE_BYTES / pixel_bytes) ** 0.5)
+    return min(512, max(64, side // 16 * 16))
+
+
 def _profile(dataset: Any) -> dict[str, Any]:
     """Tiling, interleave and codec of a GeoTIFF; a tiled one with a fast codec for other formats."""
     structure = dataset.tags(ns="IMAGE_STRUCTURE")
     rows, cols = dataset.block_shapes[0]
     profile: dict[str, Any] = {"interleave": "pixel" if dataset.interleaving == Interleaving.pixel else "band"}
     if dataset.driver != "GTiff":
-        return {**profile, "tiled": True, "blockxsize": 512, "blockysize": 512, "compress": "zstd"}
+        together = dataset.count if profile["interleave"] == "pixel" else 1
+        side = tile_side(together * np.dtype(dataset.dtypes[0]).itemsize)
+        return {**profile, "tiled": True, "blockxsize": side, "blockysize": side, "compress": "zstd"}
     if cols < dataset.width or rows % 16 == 0 == cols % 16:
         profile |= {"tiled": True, "blockxsize": cols, "blockysize": rows}
     else:
@@ -137,17 +161,47 @@ def _profile(dataset: Any) -> dict[str, Any]:
     return profile
 
 
-def _wavelengths(dataset: Any) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
-    """Band centres and widths [um] from the IMAGERY domain, or from the ENVI style tags of the bands."""
-    centres, widths = [], []
-    for index in dataset.indexes:
-        imagery, plain = dataset.tags(index, ns="IMAGERY"), dataset.tags(index)
-        centres.append(_length_um(imagery.get("CENTRAL_WAVELENGTH_UM"), "um"))
-        if centres[-1] is None:
-            centres[-1] = _length_um(plain.get("wavelength"), plain.get("wavelength_units", ""))
-        widths.append(_length_um(imagery.get("FWHM_UM"), "um"))
+def _names(dataset: Any, fields: Mapping[str, str]) -> tuple[str, ...]:
+    """Names of the bands; those of an ENVI header without the wavelengths that GDAL appends."""
+    given = envi.items(fields, "band_names", dataset.count) or dataset.descriptions
+    return tuple(name or f"band {i}" for i, name in enumerate(given, start=1))
+
+
+def _scales(dataset: Any, fields: Mapping[str, str]) -> tuple[float, ...]:
+    """Scale of each band; GDAL knows nothing of ENVI's reflectance scale factor."""
+    scale = envi.reflectance_scale(fields)
+    if scale is not None and all(value == 1 for value in dataset.scales):
+        return (scale,) * int(dataset.count)
+    return tuple(dataset.scales)
+
+
+def _band_tags(
+    dataset: Any, wavelengths_um: tuple[float, ...] | None, fwhm_um: tuple[float, ...] | None
+) -> tuple[dict[str, dict[str, str]], ...]:
+    """Tags of each band by domain; with the given wavelengths instead of those that GDAL has rounded."""
+    tags = tuple({ns: dataset.tags(i, ns=ns) for ns in ("", "IMAGERY")} for i in dataset.indexes)
+    for key, values in (("CENTRAL_WAVELENGTH_UM", wavelengths_um), ("FWHM_UM", fwhm_um)):
+        for band, value in zip(tags, values or (), strict=False):
+            band["IMAGERY"][key] = str(value)
+    return tags
+
+
+def _wavelengths(dataset: Any, fields: Mapping[str, str]) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+    """Band centres and widths [um] from an ENVI header, the IMAGERY domain, or ENVI style tags of the bands."""
+    unit = fields.get("wavelength_units", "")
+    centres, widths = (
+        [_length_um(text, unit) for text in envi.items(fields, key, dataset.count) or ()]
+        for key in ("wavelength", "fwhm")
+    )
+    if not centres:
+        for index in dataset.indexes:
+            imagery, plain = dataset.tags(index, ns="IMAGERY"), dataset.tags(index)
+            centres.append(_length_um(imagery.get("CENTRAL_WAVELENGTH_UM"), "um"))
+            if centres[-1] is None:
+                centres[-1] = _length_um(plain.get("wavelength"), plain.get("wavelength_units", ""))
+            widths.append(_length_um(imagery.get("FWHM_UM"), "um"))
     complete = all(value is not None for value in centres)
-    with_widths = complete and all(value is not None for value in widths)
+    with_widths = complete and len(widths) > 0 and all(value is not None for value in widths)
     return (tuple(centres) if complete else None, tuple(widths) if with_widths else None)  # type: ignore[arg-type]
 
 

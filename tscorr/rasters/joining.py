@@ -28,6 +28,9 @@ def join_rows(parts: Sequence[Path], path: Path) -> None:
     root.set("rasterYSize", str(sum(heights)))
     for overviews in root.findall("OverviewList"):
         root.remove(overviews)  # for the first part alone; those of the files serve without a list
+    for band in root.findall("VRTRasterBand"):
+        for table in band.findall("ColorTable"):  # 65536 lines of XML; those of the files serve
+            band.remove(table)
     for band, imagery in zip(root.findall("VRTRasterBand"), tags, strict=True):
         if imagery:  # GDAL copies the tags of the default domain only
             band.insert(0, _metadata("IMAGERY", imagery))
@@ -39,7 +42,7 @@ def join_rows(parts: Sequence[Path], path: Path) -> None:
 
 def result(folder: Path, product: str) -> RasterInfo | None:
     """A product in a folder of results: one file, or the VRT of several; None where there is neither."""
-    files = (folder / f"{product}{suffix}" for suffix in (".vrt", ".tif"))
+    files = (folder / f"{product}{suffix}" for suffix in (".vrt", ".tif", ".dat"))
     found = next((file for file in files if file.exists()), None)
     return None if found is None else describe(found, ours=True)
 

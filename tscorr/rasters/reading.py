@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +14,7 @@ from rasterio.vrt import WarpedVRT
 
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
+from tscorr.rasters.envi import PixelByPixel
 from tscorr.rasters.header import ENVIRONMENT, RasterInfo, opened, reason_of
 from tscorr.rasters.sound import open_dataset
 
@@ -73,19 +75,24 @@ class Reader:
         inside = Block(top, left, bottom - top, right - left)
         whole = inside.shape == block.shape
         if whole:
-            values = dataset.read(bands, window=inside.window)
+            values = self._pixels(dataset, inside, bands)
         else:
             leading = () if bands is not None else (self.info.bands,)
             values = np.full((*leading, *block.shape), self._fill, self._out_type())
             if inside.height > 0 and inside.width > 0:
                 rows, cols = slice(top - row, bottom - row), slice(left - col, right - col)
-                values[..., rows, cols] = dataset.read(bands, window=inside.window)
+                values[..., rows, cols] = self._pixels(dataset, inside, bands)
         if np.isnan(self._fill):
             values = values.astype(np.float32, copy=False)
             values[~np.isfinite(values)] = np.nan
             if self.info.nodata is not None:
                 values[values == np.float32(self.info.nodata)] = np.nan
         return values
+
+    def _pixels(self, dataset: Any, inside: Block, bands: int | None) -> Array:
+        """Stored values of a block that lies inside the raster."""
+        pixels = self.info.pixel_by_pixel if self._aligned and bands is None else None
+        return dataset.read(bands, window=inside.window) if pixels is None else pixels.read(inside)
 
     def _out_type(self) -> np.dtype[Any]:
         return np.dtype(np.float32) if np.isnan(self._fill) else self.info.dtype
@@ -161,11 +168,30 @@ def read_decimated(info: RasterInfo, max_size: int, bands: Sequence[int] | None 
     step = max(1.0, max(rows, cols) / max_size)
     shape = max(1, round(rows / step)), max(1, round(cols / step))
     indexes = list(bands or range(1, info.bands + 1))
+    if info.pixel_by_pixel is not None:
+        return _averages(info.pixel_by_pixel, shape, np.array(indexes) - 1, info.nodata)
     with opened(info.path, ours=info.ours) as dataset:
         values = dataset.read(indexes, out_shape=(len(indexes), *shape), resampling=Resampling.average, masked=True)
     filled = np.ma.filled(values.astype(np.float32), np.nan)
     filled[~np.isfinite(filled)] = np.nan
     return filled
+
+
+def _averages(pixels: PixelByPixel, shape: tuple[int, int], bands: Array, nodata: float | None) -> Array:
+    """The same of a BIP file, read once, row by row: means of the valid values, float32 (bands, rows, cols)."""
+    rows, cols, _ = pixels.shape
+    row_edges, col_edges = np.arange(shape[0] + 1) * rows // shape[0], np.arange(shape[1] + 1) * cols // shape[1]
+    result = np.empty((len(bands), *shape), np.float32)
+    for i, (top, bottom) in enumerate(pairwise(row_edges)):
+        total, count = np.zeros((2, len(bands), shape[1]))
+        for row in range(top, bottom):
+            line = pixels.read(Block(row, 0, 1, cols))[bands, 0].astype(float)
+            missing = (line == nodata) | (np.isnan(line) & (nodata is not None and bool(np.isnan(nodata))))
+            line[np.isinf(line)] = np.nan
+            total += np.add.reduceat(np.where(missing, 0, line), col_edges[:-1], axis=1)
+            count += np.add.reduceat(~missing, col_edges[:-1], axis=1, dtype=float)
+        result[:, i] = total / np.where(count > 0, count, np.nan)
+    return result
 
 
 def read_decimated_flags(info: RasterInfo, max_size: int) -> Array:

@@ -22,7 +22,7 @@ from tscorr.grid import Grid
 
 DRIVERS = ("GTiff", "ENVI", "HFA", "JP2OpenJPEG", "PNG", "JPEG", "AAIGrid", "EHdr")
 """formats that are opened; a VRT from an unknown hand may name any file of the machine"""
-RESULTS = ("GTiff", "VRT")
+RESULTS = ("GTiff", "VRT", "ENVI")
 """formats that are written"""
 NUMBERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64")
 LARGEST_TILE_BYTES = 256e6

@@ -18,7 +18,7 @@ from tscorr.errors import OutputError
 from tscorr.grid import Block
 from tscorr.rasters import tiff
 from tscorr.rasters.encoding import Encoder
-from tscorr.rasters.header import ENVIRONMENT, RasterInfo
+from tscorr.rasters.header import ENVIRONMENT, RasterInfo, tile_side
 
 Array = NDArray[Any]
 
@@ -36,7 +36,7 @@ class Writer:
     def __init__(self, path: Path, profile: dict[str, Any], like: RasterInfo, layer: "Layer") -> None:
         self.path = path
         self._lock = threading.Lock()
-        self._written: list[_Stretch] = []
+        self._written: list[Stretch] = []
         self._sample: tuple[Block, int] | None = None
         rows, cols = like.shape
         options = _fitting_predictor(
@@ -52,6 +52,7 @@ class Writer:
                 "nodata": layer.nodata,
                 "bigtiff": "if_safer",
                 "sparse_ok": True,
+                **({} if layer.palette is None else {"photometric": "palette"}),
             },
             np.dtype(layer.dtype),
         )
@@ -77,8 +78,8 @@ class Writer:
                 with self._lock:
                     start, self._end = self._end, self._end + len(tiles.data)
                     self._sample = self._sample or (block, checksum(np.ascontiguousarray(values).data))
-                _write(self._file, tiles.data, start)
-                written = _Stretch(start, len(tiles.data), checksum(tiles.data))
+                write_at(self._file, tiles.data, start)
+                written = Stretch(start, len(tiles.data), checksum(tiles.data))
                 with self._lock:
                     self._written.append(written)
                     self._offsets[numbers], self._sizes[numbers] = start + tiles.offsets, tiles.sizes
@@ -93,9 +94,9 @@ class Writer:
         """Close, and raise OutputError unless every block reads back as it was written."""
         try:
             for words, numbers in zip(self._places, (self._offsets, self._sizes), strict=True):
-                _write(self._file, tiff.octets(numbers.astype(words.dtype)), words.start)
+                write_at(self._file, tiff.octets(numbers.astype(words.dtype)), words.start)
             whole = bool(self._sizes.all()) and all(
-                checksum(_read(self._file, stretch)) == stretch.checksum for stretch in self._written
+                checksum(read_at(self._file, stretch)) == stretch.checksum for stretch in self._written
             )
         except OSError as error:
             raise OutputError(f"{self.path} does not read back as written: {error}; is the disk full?") from None
@@ -116,7 +117,7 @@ class Writer:
             return False
 
 
-class _Stretch(NamedTuple):
+class Stretch(NamedTuple):
     """Bytes that were written in one go: where, how many, and their checksum."""
 
     start: int
@@ -134,14 +135,14 @@ def checksum(data: Any) -> int:
     return int(octets[:words].view(np.uint64).sum()) + int(octets[words:].sum())
 
 
-def _write(file: int, data: memoryview, start: int) -> None:
+def write_at(file: int, data: memoryview, start: int) -> None:
     """Write all of a buffer at a place of a file; OSError where it does not fit the disk."""
     done = 0
     while done < len(data):
         done += os.pwrite(file, data[done:], start + done)
 
 
-def _read(file: int, stretch: _Stretch) -> bytes:
+def read_at(file: int, stretch: Stretch) -> bytes:
     """The bytes of a stretch, fewer where the file ends before."""
     return os.pread(file, stretch.size, stretch.start)
 
@@ -163,6 +164,8 @@ def _describe(dataset: Any, layer: "Layer", like: RasterInfo) -> None:
         dataset.scales, dataset.offsets = layer.scales, layer.offsets
     if layer.units is not None:
         dataset.units = layer.units
+    if layer.palette is not None:
+        dataset.write_colormap(1, dict(enumerate(map(tuple, layer.palette.tolist()))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +181,8 @@ class Layer:
     of_image: bool = False
     """the bands are those of the image: their tags are copied"""
     tags: Mapping[str, str] = field(default_factory=dict)
+    palette: Array | None = None
+    """red, green, blue of each value that the type can hold: uint8 (values, 3)"""
 
 
 def _fitting_predictor(options: dict[str, Any], dtype: np.dtype[Any]) -> dict[str, Any]:
@@ -200,9 +205,10 @@ def make_cog(path: Path, resampling: Resampling) -> None:
         with rasterio.Env(**ENVIRONMENT):
             with rasterio.open(path, "r+") as dataset:
                 profile, longest = dataset.profile, max(dataset.shape)
+                side = tile_side(dataset.count * np.dtype(dataset.dtypes[0]).itemsize)  # its bands stand together
                 levels = [2**i for i in range(1, 16) if longest // 2 ** (i - 1) > COG_TILE]
                 dataset.build_overviews(levels, resampling)
-            options = {"blocksize": COG_TILE, "overviews": "FORCE_USE_EXISTING" if levels else "NONE"}
+            options = {"blocksize": side, "overviews": "FORCE_USE_EXISTING" if levels else "NONE"}
             options["compress"] = profile.get("compress", "none")
             options["predictor"] = "YES" if options["compress"] in {"deflate", "lzw", "zstd"} else "NO"
             copy_raster(path, hidden, driver="COG", **options)

@@ -22,6 +22,7 @@ from tscorr.report import SceneFacts, page, summary, write_json
 from tscorr.scene.pictures import PICTURE_PX, draw_quicklook
 from tscorr.scene.plan import Scene
 from tscorr.scene.run import Pipeline, Progress, Sums, silent
+from tscorr.scene.styles import flag_style
 from tscorr.scene.truth import residual_glare
 from tscorr.sensor import FrameView
 from tscorr.sun import solar_path
@@ -100,9 +101,14 @@ def finish(scene: Scene, publication: publish.Publication, sums: Sums, wall_s: f
     folder = publication.folder
     facts = facts_of(scene, sums, wall_s)
     report = summary(facts)
+    if "flags" in scene.config.output.products:
+        style = flag_style(np.flatnonzero(sums.flags).tolist())
+        (folder / "flags.qml").write_text(style, encoding="utf-8")
     corrected = rasters.result(folder, "corrected")
     if corrected is not None and (residual := residual_glare(scene, corrected)) is not None:
         report["residual_glare"] = residual
+    if scene.bad_names:
+        report["bad_bands"] = scene.bad_names
     picture = draw_quicklook(scene, folder) if scene.config.output.quicklook else None
     write_json(report, folder / "report.json")
     widths = _decimated_widths(folder)
@@ -204,6 +210,7 @@ def stac_item(scene: Scene, folder: Path, facts: SceneFacts, report: Mapping[str
         grid=scene.grid,
         datetime=scene.sun.time,
         files=_results(scene, folder),
+        cloud_optimised=scene.config.output.format == "cog",
         strips=sorted(path.name for path in folder.glob("*.*.tif")),
         inputs=scene.inputs,
         solar_zenith_deg=facts.solar_zenith_deg,

@@ -30,9 +30,12 @@ def explanation(scene: Scene, row: int, col: int) -> dict[str, dict[str, Any]]:
             material_rows = class_rows(class_value, scene.rows)
             stored = pipeline.image.read(block)
             pipeline.ground.prepare()
-            inputs, _ = pipeline.inputs(block, stored.copy(), material_rows, np.ones((1, 1), np.bool_))
+            visible = stored.copy()
+            bad = pipeline.bad_bands.set_aside(visible)
+            inputs, _ = pipeline.inputs(block, visible, material_rows, np.ones((1, 1), np.bool_))
             heights = pipeline.ground.surface.heights(block)
         result = pipeline.corrector(inputs, first_row=row)
+        pipeline.bad_bands.put_back(result.corrected, bad)
     lines = {
         "pixel": _pixel(scene, row, col, int(class_value[0, 0]), float(heights[0, 0]))
         | scene.view.describe(scene.grid, block, heights),

@@ -36,6 +36,7 @@ def forecast(scene: Scene) -> dict[str, Any]:
         "rows": rows,
         "cols": cols,
         "bands": scene.image.bands,
+        "bad_bands": scene.bad_names,
         "sun": {"zenith_deg": scene.sun.zenith_deg, "azimuth_deg": scene.sun.azimuth_deg},
         "view_zenith_deg": [float(np.quantile(zenith, q)) for q in (0, 0.5, 1)] if zenith.size else None,
         "materials": {

@@ -41,7 +41,7 @@ def overlaps(results: Sequence[tuple[Scene, Path]]) -> list[Overlap]:
         (region, one, two)
         for one, two in combinations(whole, 2)
         if one[0].wavelengths_um == two[0].wavelengths_um
-        and one[0].image.bands == two[0].image.bands
+        and one[0].good_bands == two[0].good_bands
         and (region := common_region(one[0].grid, two[0].grid)) is not None
     ]
     shared.sort(key=lambda pair: -pair[0].height * pair[0].width)
@@ -140,8 +140,9 @@ class _Seen:
             "corrected": files.enter_context(rasters.Reader(corrected, grid)),
         }
         self._flags = files.enter_context(rasters.Reader(flags, grid, fill=UNKNOWN))
+        self._good = scene.good_bands
         self._scale, self._offset = (
-            np.array(values)[:, None, None] for values in (scene.stored.scale, scene.stored.offset)
+            np.array(values)[self._good, None, None] for values in (scene.stored.scale, scene.stored.offset)
         )
 
     def flags(self, block: Block) -> Array:
@@ -149,5 +150,5 @@ class _Seen:
         return self._flags.read(block, 1)
 
     def reflectance(self, layer: str, block: Block) -> Array:
-        """Reflectance factor (bands, rows, cols) of "image" or "corrected"."""
-        return self._layers[layer].read(block) * self._scale + self._offset
+        """Reflectance factor (bands, rows, cols) of "image" or "corrected", without bands that are marked as bad."""
+        return self._layers[layer].read(block)[self._good] * self._scale + self._offset

@@ -24,7 +24,7 @@ BANDS_AT_ONCE = 8
 def draw_quicklook(scene: Scene, folder: Path) -> Path:
     """The picture of before, after and flags, of a scene that is being published."""
     image = scene.image
-    wavelengths = scene.wavelengths_um or (float("nan"),) * image.bands
+    wavelengths = _good(scene.wavelengths_um, image)
     matrix = quicklook.rgb_matrix(wavelengths, image.fwhm_um)
     used = quicklook.used_bands(matrix)
     result = rasters.result(folder, "corrected") or image
@@ -63,7 +63,7 @@ def draw_image(
     if output.resolve() == image.resolve():
         raise InputError(f"the picture {output} is the image itself; name another")
     info = rasters.describe(image)
-    wavelengths = info.wavelengths_um or (float("nan"),) * info.bands
+    wavelengths = _good(info.wavelengths_um, info)
     matrix = quicklook.rgb_matrix(wavelengths, info.fwhm_um, style)
     used = quicklook.used_bands(matrix)
     light = quicklook.linear_rgb(_reflectance(info, used, info.scales, info.offsets, max_px), matrix[used])
@@ -75,6 +75,13 @@ def draw_image(
         factor = quicklook.exposure_for(light) if exposure is None else exposure
         quicklook.write_png(quicklook.srgb(light, factor), output)
     return f"{note}; exposure {factor:.3g}"
+
+
+def _good(wavelengths_um: tuple[float, ...] | None, image: rasters.RasterInfo) -> tuple[float, ...]:
+    """Wavelengths of the bands; nan where they are unknown, or the band is marked as bad and not to be shown."""
+    known = wavelengths_um or (float("nan"),) * image.bands
+    bad = image.bad_bands or (False,) * image.bands
+    return tuple(float("nan") if is_bad else um for um, is_bad in zip(known, bad, strict=True))
 
 
 def _reflectance(

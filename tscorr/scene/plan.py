@@ -13,6 +13,7 @@ from tscorr.correction import NEGLIGIBLE_REFLECTANCE, Rules, Stored
 from tscorr.errors import ConfigError, InputError, MaterialError, TscorrError
 from tscorr.grid import Grid
 from tscorr.materials import BandParameters, Material, find
+from tscorr.scene.bad_bands import parameters_of
 from tscorr.scene.directions import Seen, close_all, obs_file, sun_of, view_of
 from tscorr.sensor import View
 from tscorr.sun import Sun
@@ -97,6 +98,17 @@ class Scene:
         if self.settings.truth is not None:
             files += [Path(self.settings.truth.diffuse), Path(self.settings.truth.sunlit)]
         return [*files, *self.seen.files, *map(Path, self.config.materials.library)]
+
+    @property
+    def good_bands(self) -> list[int]:
+        """Places of the bands that the image does not mark as bad."""
+        bad = self.image.bad_bands or (False,) * self.image.bands
+        return [band for band, is_bad in enumerate(bad) if not is_bad]
+
+    @property
+    def bad_names(self) -> list[str]:
+        """Names of the bands that the image marks as bad: they are left as they are."""
+        return [name for band, name in enumerate(self.image.names) if band not in self.good_bands]
 
     @property
     def heights_file(self) -> rasters.RasterInfo | None:
@@ -195,6 +207,8 @@ def _image(settings: config.Scene) -> rasters.RasterInfo:
     if image.dtype.name not in rasters.IMAGE_TYPES:
         allowed = ", ".join(rasters.IMAGE_TYPES)
         raise InputError(f"the image {image.path} holds {image.dtype} values; allowed are {allowed}")
+    if image.bad_bands and all(image.bad_bands):
+        raise InputError(f"the image {image.path} marks every band as bad; allowed is bbl = 1 for at least one")
     return image
 
 
@@ -257,7 +271,7 @@ def _check_truth(truth: config.Truth | None, image: rasters.RasterInfo) -> None:
 
 def _at_bands(surface: Material, wavelengths: tuple[float, ...] | None, image: rasters.RasterInfo) -> BandParameters:
     try:
-        return surface.at(wavelengths, image.bands)
+        return parameters_of(surface, wavelengths, image.bad_bands, image.bands)
     except MaterialError as error:
         raise MaterialError(f"{error}; image {image.path}") from None
 
@@ -294,13 +308,15 @@ def _stored(settings: config.Scene, image: rasters.RasterInfo) -> Stored:
     to_factor = np.pi if settings.quantity == "brdf" else 1.0
     if settings.nodata is not None and not rasters.can_hold(image.dtype, settings.nodata):
         raise ConfigError(f"nodata = {settings.nodata:g}, which no {image.dtype} pixel of {image.path} can be")
-    saturation = settings.saturation
+    saturation = None if settings.saturation is None else _per_band(settings.saturation, image, "saturation")
+    if saturation is not None and image.bad_bands:
+        saturation = tuple(np.where(image.bad_bands, np.inf, saturation).tolist())
     return Stored(
         dtype=image.dtype,
         scale=tuple(value * to_factor for value in scale),
         offset=tuple(value * to_factor for value in offset),
         nodata=image.nodata if settings.nodata is None else settings.nodata,
-        saturation=None if saturation is None else _per_band(saturation, image, "saturation"),
+        saturation=saturation,
     )
 
 

@@ -27,6 +27,8 @@ from tscorr.correction import (
 )
 from tscorr.correction.edges import ShadowByBrightness
 from tscorr.grid import Block, blocks, north_of
+from tscorr.quicklook import flag_palette
+from tscorr.scene.bad_bands import BadBands
 from tscorr.scene.ground import Ground
 from tscorr.scene.plan import Scene
 from tscorr.width import lobe_shapes, width_table
@@ -161,6 +163,7 @@ class Pipeline:
         self.corrector = Corrector(
             scene.materials, scene.stored, skip=scene.config.run.skip, tally_stride=scene.tally_stride
         )
+        self.bad_bands = BadBands(scene.image.bad_bands)
         self._by_brightness = ShadowByBrightness.of(scene.materials, scene.stored, scene.wavelengths_um)
         self.sums = Sums(len(scene.materials), scene.image.bands)
         self._products = set(scene.config.output.products)
@@ -207,6 +210,7 @@ class Pipeline:
         with self.sums.timed("read"):
             rows = class_rows(self.classes.read(block, 1), self.scene.rows)
             image = self.image.read(block)
+            bad = self.bad_bands.set_aside(image)
         needed = self.corrector.peaks[rows]
         skipped = None if needed.any() else "blocks_no_specular_material"
         with self.sums.timed("geometry"):
@@ -214,6 +218,7 @@ class Pipeline:
         layers = self._angle_layers(block, inputs, unseen)
         with self.sums.timed("kernel"):
             result = self.corrector(inputs, first_row=block.row, want_removed="removed" in self._products)
+        self.bad_bands.put_back(result.corrected, bad)
         layers |= {"corrected": result.corrected, "flags": result.flags[None]}
         if result.removed is not None:
             layers["removed"] = result.removed
@@ -300,7 +305,7 @@ class Pipeline:
                     widths[mine] = table.at(incidence[mine])
         return widths
 
-    def _writer(self, name: str) -> rasters.Writer:
+    def _writer(self, name: str) -> rasters.Writer | rasters.EnviWriter:
         image, stored = self.scene.image, self.scene.stored
         tags = {"TSCORR_VERSION": __version__, "TSCORR_SCENE": self.scene.name, "TSCORR_PRODUCT": name}
         profile = dict(image.profile)
@@ -321,13 +326,17 @@ class Pipeline:
         layers = {
             "corrected": like_image,
             "removed": replace(like_image, nodata=None, offsets=(0.0,) * image.bands),
-            "flags": rasters.Layer(names=("flags",), dtype="uint16", tags={**tags, **FLAG_TAGS}),
+            "flags": rasters.Layer(
+                names=("flags",), dtype="uint16", tags={**tags, **FLAG_TAGS}, palette=flag_palette()
+            ),
             "azimuthal_width": replace(angles, names=("azimuthal width",), units=("degree",)),
             "angles": angles,
         }
         if not layers[name].of_image:
             profile |= FASTER_CODEC.get(profile["compress"], {})
         like = image if self._strip is None else image.crop(self._strip)
+        if self.scene.config.output.format == "envi":
+            return rasters.EnviWriter(self.folder / f"{name}{rasters.ENVI_SUFFIX}", like, layers[name])
         return rasters.Writer(self.folder / f"{name}.tif", profile, like, layers[name])
 
 

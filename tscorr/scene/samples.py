@@ -141,6 +141,7 @@ class _Gatherer:
         usable = np.isin(rows, list(self._reservoirs)) & _amid_its_own(around)
         if usable.any():
             image = self._pipeline.image.read(block)
+            self._pipeline.bad_bands.set_aside(image)
             usable &= self._valid(image)
             inputs, _ = self._pipeline.inputs(block, image, np.ascontiguousarray(rows), usable)
             for mask in (inputs.shadowed, inputs.hidden, inputs.unreliable, inputs.low_confidence):
@@ -202,17 +203,19 @@ class _Gatherer:
             incidence, exitance, phi, plane, sky_view, roof = reservoir.values[:OF_PLACE]
             if rules.irradiance_plane == "facet":
                 plane = sky_view = np.ones_like(plane)
-            beta = _column(rules.direct_fraction)
+            good = self._scene.good_bands
+            beta = _column(np.broadcast_to(rules.direct_fraction, self._scene.image.bands)[good].tolist())
+            wavelengths = self._scene.wavelengths_um
             yield ImageSamples(
                 name=material.name,
                 incidence_deg=incidence,
                 exitance_deg=exitance,
                 relative_azimuth_deg=phi,
-                reflectance_factor=reservoir.values[OF_PLACE:],
+                reflectance_factor=reservoir.values[OF_PLACE:][good],
                 direct=beta * plane,
                 diffuse=beta * plane + (1 - beta) * sky_view,
                 roof=roof,
-                wavelength_um=self._scene.wavelengths_um or (),
+                wavelength_um=() if wavelengths is None else tuple(wavelengths[band] for band in good),
                 source=self._scene.name,
             )
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from tscorr import publish, rasters
 from tscorr.correction import Corrector, add_tally, new_tally
+from tscorr.errors import ConfigError
 from tscorr.grid import Block, blocks
 from tscorr.scene.correct import finish, peak_rss_mb, target_of
 from tscorr.scene.ground import Ground
@@ -84,6 +85,8 @@ def clear(scene: Scene, keep: Path | None = None) -> None:
 def prepare(strips: Strips) -> None:
     """Sweep the whole scene for what is in shadow or hidden, and keep the masks for its strips."""
     scene, masks = strips.scene, strips.folder / MASKS
+    if scene.config.output.format == "envi":
+        raise ConfigError("[output] format = 'envi' cannot be cut into strips; allowed are 'gtiff' and 'cog'")
     if masks.exists():
         return
     unfinished = masks.with_name(f"{MASKS}.{uuid4().hex[:8]}.part")
