@@ -363,6 +363,20 @@ def test_assets_lie_beside_the_item(scene, validator, tmp_path):
     assert "data-mask" in item.assets["flags"].roles
 
 
+def test_media_types_are_those_of_the_files(scene, validator):
+    assets = validated(stac.item(**scene, cloud_optimised=True), validator).assets
+    assert assets["corrected"].media_type == pystac.MediaType.COG
+    assert validated(stac.item(**scene), validator).assets["corrected"].media_type == pystac.MediaType.GEOTIFF
+    flags = scene["files"]["flags"]
+    scene["files"]["flags"] = replace(flags, path=flags.path.with_suffix(".dat"))
+    assets = validated(stac.item(**scene), validator).assets
+    assert (assets["flags"].href, assets["flags_header"].href) == ("./flags.dat", "./flags.hdr")
+    assert (assets["flags"].media_type, assets["flags_header"].media_type) == (
+        "application/octet-stream",
+        "text/plain",
+    )
+
+
 def test_no_quicklook_where_none_was_drawn(scene):
     assert "quicklook" not in stac.item(**scene, quicklook=False)["assets"]
 

@@ -3,7 +3,7 @@
 import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from xml.etree import ElementTree
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -404,7 +404,7 @@ def test_flags_have_a_colour_table_and_a_legend_of_what_occurs(tmp_path):
         assert table[unknown_value] == colours["no material"]
         assert table[unknown_value | PixelFlag.NODATA] == colours["no data"]
         assert len(table) == 1 << 16
-        entries = ElementTree.parse(folder / "flags.qml").getroot().iter("paletteEntry")
+        entries = ET.parse(folder / "flags.qml").getroot().iter("paletteEntry")
         legend = {int(entry.get("value")): (entry.get("label"), entry.get("color")) for entry in entries}
         assert set(legend) == set(np.unique(flags).tolist())
         assert legend[corrected_value] == ("corrected", "#009e73")
@@ -412,5 +412,5 @@ def test_flags_have_a_colour_table_and_a_legend_of_what_occurs(tmp_path):
 
 
 def test_a_legend_names_the_flags_that_no_colour_tells():
-    (entry,) = ElementTree.fromstring(flag_style([(1 << 6) | PixelFlag.CLIPPED])).iter("paletteEntry")
+    (entry,) = ET.fromstring(flag_style([(1 << 6) | PixelFlag.CLIPPED])).iter("paletteEntry")
     assert entry.get("label") == "corrected: CLIPPED"
