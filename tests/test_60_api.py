@@ -1,14 +1,15 @@
 """The functions for notebooks: their examples, against the paper's table, and what they refuse."""
 
 import doctest
+import inspect
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from small_scene import small_scene
 
 import tscorr
-from tscorr import api
 from tscorr.angles import unit_vector
 from tscorr.errors import InputError, MaterialError
 
@@ -17,8 +18,24 @@ PAPER = [name for name, values in TABLE["materials"].items() if "chi2_df" in val
 PEAK = unit_vector(40.0, 180.0), unit_vector(42.0, 0.0)
 
 
-def test_the_examples_of_the_docstrings():
-    result = doctest.testmod(api)
+FUNCTIONS = [name for name in tscorr.__all__ if inspect.isfunction(getattr(tscorr, name))]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with what the examples name."""
+    small_scene(tmp_path).rename(tmp_path / "city.toml")
+    (tmp_path / "samples").symlink_to(Path(__file__).parent.parent / "samples")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_public_function_has_an_example_that_is_right(name):
+    function = getattr(tscorr, name)
+    known = {"np": np, **{public: getattr(tscorr, public) for public in tscorr.__all__}}
+    tests = doctest.DocTestFinder(recurse=False).find(function, name, globs=known)
+    result = doctest.DocTestRunner().run(tests[0])
     assert result.attempted > 0
     assert result.failed == 0
 
@@ -41,6 +58,21 @@ def test_brdf_broadcasts_and_has_edges():
     assert tscorr.brdf(spectral, 0, 0, 0, wavelength_um=0.6) == pytest.approx(0.2)
     with pytest.raises(MaterialError, match="wavelengths"):
         tscorr.brdf(spectral, 0, 0, 0)
+
+
+def test_dataarrays_come_back_as_they_went_in():
+    xarray = pytest.importorskip("xarray")
+    places = {"band": [475, 560], "y": [3.0, 2.0, 1.0], "x": [0.5, 1.0, 1.5, 2.0]}
+    image = xarray.DataArray(IMAGE, places, ("band", "y", "x"), name="flight", attrs={"units": "1"})
+    classes = xarray.DataArray(CLASSES, {key: places[key] for key in "yx"}, ("y", "x"))
+    plain, labelled = tscorr.correct(IMAGE, CLASSES, TILE, *PEAK), tscorr.correct(image, classes, TILE, *PEAK)
+    for key in ("corrected", "removed"):
+        expected = image.copy(data=getattr(plain, key))
+        xarray.testing.assert_identical(getattr(labelled, key), expected)
+    xarray.testing.assert_identical(labelled.flags, classes.rename("flight").copy(data=plain.flags))
+    single = tscorr.correct(image[0], classes, TILE, *PEAK)
+    xarray.testing.assert_identical(single.corrected, labelled.corrected[0])
+    assert plain.removed.any()
 
 
 def test_public_names_are_there():

@@ -1,5 +1,6 @@
 """The functions for notebooks: arrays in, arrays out."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -48,6 +49,7 @@ class CorrectionResult:
 
     corrected, removed : (bands, rows, cols), of the type of the input; input - removed = corrected.
     flags : uint16 (rows, cols), bits of `PixelFlag`.
+    Arrays of numpy, or of xarray where the image was one.
     """
 
     corrected: Array
@@ -82,7 +84,19 @@ def correct(
     sun, view, normal : unit vectors east, north, up: (3,) or (3, rows, cols); normal is up by default.
     shadowed, hidden  : bool (rows, cols), where something stands before the sun or before the sensor.
     rules     : how to correct; by default R refers to the horizontal plane and all light is direct.
-    Raises InputError where shapes or types do not fit. The input is not changed.
+    Raises InputError where shapes or types do not fit. The input is not changed. A DataArray of xarray comes back as
+    DataArrays with its dimensions, (bands, rows, cols) or (rows, cols) in this order, and coordinates.
+
+    The sun in the south and the sensor in the north, both at 40 degrees, over a tiled roof and the street beside it:
+
+    >>> from tscorr.angles import unit_vector
+    >>> image = np.full((3, 1, 2), 0.5, np.float32)
+    >>> sun, view = unit_vector(40, 180), unit_vector(40, 0)
+    >>> result = correct(image, [[1, 2]], {1: "roof_tile", 2: "lambertian"}, sun, view)
+    >>> result.corrected[0].round(3)
+    array([[0.402, 0.5  ]], dtype=float32)
+    >>> specular_state(result.flags)  # corrected, negligible
+    array([[1, 0]], dtype=uint16)
     """
     image = np.asarray(reflectance_factor)
     if image.dtype.name not in {"uint8", "int16", "uint16", "float32"}:
@@ -120,8 +134,17 @@ def correct(
     result = Corrector(entries, stored, skip=skip)(inputs)
     assert result.removed is not None
     if image.ndim == 2:
-        return CorrectionResult(result.corrected[0], result.removed[0], result.flags)
-    return CorrectionResult(result.corrected, result.removed, result.flags)
+        return _labelled(result.corrected[0], result.removed[0], result.flags, reflectance_factor)
+    return _labelled(result.corrected, result.removed, result.flags, reflectance_factor)
+
+
+def _labelled(corrected: Array, removed: Array, flags: Array, image: Any) -> CorrectionResult:
+    """The arrays with the labels of the image where that is a DataArray; nobody who has one lacks xarray."""
+    xarray = sys.modules.get("xarray")
+    if xarray is None or not isinstance(image, xarray.DataArray):
+        return CorrectionResult(corrected, removed, flags)
+    of_band = image.isel(dict.fromkeys(image.dims[:-2], 0), drop=True).drop_attrs()
+    return CorrectionResult(image.copy(data=corrected), image.copy(data=removed), of_band.copy(data=flags))
 
 
 def _vectors(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -30,6 +30,10 @@ def run(
     overwrite : recompute scenes whose published result is current.
     Raises ConfigError, MaterialError or InputError before any work starts, OutputError where another batch is at work
     in the folder; later errors fail their scene.
+
+    >>> result = run("city.toml")
+    >>> [(scene.name, scene.state) for scene in result.scenes], result.exit_code
+    ([('roofs', 'done')], 0)
     """
     if not isinstance(settings, config.Config):
         settings = config.load_config(settings)

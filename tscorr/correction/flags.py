@@ -43,5 +43,9 @@ class SpecularState(IntEnum):
 
 
 def specular_state(flags: Array) -> Array:
-    """The `SpecularState` of each pixel of a flag layer."""
+    """The `SpecularState` of each pixel of a flag layer.
+
+    >>> specular_state(np.array([0, 64, 128 | PixelFlag.SATURATED, 194]))
+    array([0, 1, 2, 3])
+    """
     return (flags >> SPECULAR_STATE_SHIFT) & 3

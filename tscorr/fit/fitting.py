@@ -80,6 +80,11 @@ def fit_brdf(
 
     Raises InputError where the data cannot be fitted: phi reversed, too few samples, a lobe narrower than
     the sampling. What is only doubtful is said in `FitResult.warnings`.
+
+    >>> incidence, exitance = (angle.ravel() for angle in np.meshgrid([20, 40, 60], np.arange(0, 75, 2.5)))
+    >>> result = fit_brdf(incidence, exitance, 180 + 0 * exitance, brdf("red_concrete", incidence, exitance, 180))
+    >>> round(float(result.material.w[0]), 4)
+    0.0804
     """
     measured = Measurements.of(
         incidence_deg,

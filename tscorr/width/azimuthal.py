@@ -38,6 +38,9 @@ def azimuthal_width(
     (0, 90), and for a material without a peak: `why_no_width` says which. A very broad lobe of an index
     with a normal reflectance above 1/3 might cross the half more than once; then one crossing is found.
     Error: relative 1e-14 (1 + (w D)^2), D half the difference of the angles; more where a width nears 360.
+
+    >>> azimuthal_width(material("roof_tile"), [30, 50, 65]).round(1)
+    array([185.6,  78.7,  42.3])
     """
     shape, simplified = lobe_shape(m, wavelength_um), is_simplified(form)
     incidence, exitance = _pair(incidence_deg, exitance_deg)
