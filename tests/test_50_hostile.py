@@ -1,8 +1,17 @@
 """Rasters, names and texts from an unknown hand: refused by name before a pixel is read, and shown as plain text."""
 
+import json
+import os
 import re
 import struct
+import subprocess
+import sys
 import time
+from collections import Counter
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -16,6 +25,7 @@ from small_scene import (
     image_values,
     write_config,
     write_image,
+    write_inputs,
     write_raster,
 )
 
@@ -281,8 +291,6 @@ def test_honest_overviews_and_masks_are_accepted(tmp_path):
 
 
 def test_a_folder_or_a_pipe_is_no_raster(tmp_path):
-    import os
-
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path, tmp_path / "pipe"):
         with pytest.raises(InputError, match=f"{path} is no file; allowed is a raster"):
@@ -333,3 +341,206 @@ def test_a_nodata_value_that_is_no_number_is_refused(tmp_path, profile, number, 
 @pytest.mark.parametrize("profile", [{}, {"bigtiff": "yes"}, {"endianness": "big"}], ids=str)
 def test_a_nodata_value_of_zero_is_a_number(tmp_path, profile):
     assert rasters.describe(write_image(tmp_path / "image.tif", nodata=0, **profile)).nodata == 0
+
+
+# Mutated files.
+
+PROCESSES, CASES = 2, 1100
+
+
+def fuzzed(folder, first):
+    """A process of mutated cases, started."""
+    command = [sys.executable, Path(__file__).with_name("fuzzing.py"), folder / f"from{first}", first, CASES]
+    stderr = (folder / f"stderr{first}").open("w")
+    return subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=stderr, text=True), stderr
+
+
+def test_mutated_headers_tables_and_configurations_end_in_one_message_or_in_a_result(tmp_path, capsys):
+    running = [(first, *fuzzed(tmp_path, first)) for first in range(0, PROCESSES * CASES, CASES)]
+    total = Counter()
+    for first, process, stderr in running:
+        lines = process.communicate()[0].splitlines()
+        stderr.close()
+        log = (tmp_path / f"stderr{first}").read_text(errors="replace")
+        assert process.returncode in {0, 1}, f"ended with {process.returncode} at {lines[-1:]}: {log[-3000:]}"
+        summary = json.loads(lines[-1])
+        assert summary["bad"] == []
+        assert "Traceback" not in log
+        assert summary["peak_mb"] < 1000
+        total.update(summary["counts"])
+    states = Counter(name.split()[-1] for name in total.elements())
+    with capsys.disabled():
+        sys.stdout.write(f"\n{total.total()} mutated cases: {dict(states)}\n")
+    assert total.total() == PROCESSES * CASES >= 2000
+    assert min(states["refused"], states["planned"], states["done"]) > 10
+    assert len({name.split()[0] for name in total}) == 12
+
+
+# Names and texts.
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("../../x", "/etc/x", "a/b", "a\\b", "", " ", ".", "..", ".hidden", "ends.", "ends ", " begins", "x" * 101),
+        *("<script>", "a:b", "what?", "*", "con", "CON", "nul.txt", "Com1", "batch.json", "Index.html"),
+        *("a\nb", "a\x1b[31mb", "a\0b", "\u202egnp", "\u200b", "ж" * 51),
+    ],
+    ids=ascii,
+)
+def test_a_name_that_is_no_folder_on_some_system_is_refused(tmp_path, name):
+    message = planned(tmp_path, name=name)
+    assert "a name is a folder on any system" in message
+    assert message.isprintable()
+
+
+@pytest.mark.parametrize("names", [("roofs", "Roofs"), ("straße", "STRASSE"), ("caf\u00e9", "cafe\u0301")], ids=ascii)
+def test_names_that_are_one_folder_on_some_system_are_refused(tmp_path, names):
+    write_inputs(tmp_path)
+    with pytest.raises(TscorrError, match="are one folder; give them a name each"):
+        load_config(write_config(tmp_path, *({"name": name} for name in names)))
+
+
+@pytest.mark.parametrize("key", ["image", "class_map"])
+@pytest.mark.parametrize(
+    "path", ["a\0b.tif", "a\x1b[2Jb.tif", "x" * 300 + ".tif", "y/" * 1500, "a\nb*.tif"], ids=ascii
+)
+def test_a_path_that_no_file_can_have_is_refused(tmp_path, key, path):
+    message = planned(tmp_path, **{key: path})
+    assert "can be of no file; allowed are printable characters" in message
+    assert message.isprintable()
+
+
+MARKUP = "&<i>x</i>\"'[red]{0}"
+"""what HTML, SVG, XML, a terminal and a format string would each take for their own"""
+
+
+@pytest.fixture(scope="module")
+def marked_up(tmp_path_factory):
+    """Folder of a finished batch whose every name and text is hostile."""
+    folder = tmp_path_factory.mktemp("marked up")
+    image = write_image(folder / f"a{MARKUP.replace('/', '')}.tif")
+    with rasterio.open(image, "r+") as file:
+        file.update_tags(NOTE=MARKUP, TIFFTAG_ARTIST=MARKUP)
+        for band in file.indexes:
+            file.set_band_description(band, f"{MARKUP}{band}")
+    write_raster(folder / "class_map.tif", class_map())
+    write_raster(folder / "dsm.tif", heights())
+    text = json.dumps(MARKUP)
+    (folder / "own.toml").write_text(f"[{text}]\nsource = {text}\nt0 = 0.02\nt1 = 0.2\nw = 0.04\nn = 1.7\n")
+    products = ["corrected", "flags", "removed", "azimuthal_width"]
+    config = write_config(
+        folder,
+        {"name": "a & b '[red]' {0}%s", "image": image.name},
+        {"name": "naïve ж 漢", "image": image.name},
+        title=f"{MARKUP}\x1b[2J",
+        output={"directory": "out", "products": products},
+        materials={"library": ["own.toml"], "classes": {"1": MARKUP, "4": "red_aluminum", "5": "lambertian"}},
+    )
+    result = batch.run(config)
+    assert [scene.error for scene in result.scenes] == ["", ""]
+    return folder
+
+
+class Tags(HTMLParser):
+    """All tags of a page; the tag <i> is in use only with attributes."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.texts = Counter(), []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.open[tag, bool(attrs)] += 1
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+def test_no_text_from_outside_is_markup_in_a_page(marked_up):
+    pages = sorted((marked_up / "out").rglob("*.html"))
+    assert len(pages) == 3
+    for path in pages:
+        page = path.read_text(encoding="utf-8")
+        tags = Tags(page)
+        assert tags.open["i", False] == 0, path
+        assert any("<i>x</i>" in text for text in tags.texts), path
+        for drawing in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
+            assert "<i>" not in drawing
+    index = (marked_up / "out" / "index.html").read_text(encoding="utf-8")
+    links = [unquote(unescape(link)) for link in re.findall(r'href="([^"]*report\.html)"', index)]
+    assert all((marked_up / "out" / link).is_file() for link in links)
+    assert len(links) == 2
+
+
+def test_pages_name_a_batch_and_its_scenes_as_they_are_called(marked_up):
+    texts = Tags((marked_up / "out" / "index.html").read_text(encoding="utf-8")).texts
+    assert any("a & b '[red]' {0}%s" in text for text in texts)
+    assert any("naïve ж 漢" in text for text in texts)
+
+
+def test_hostile_texts_come_back_from_json_and_from_tags_as_they_were(marked_up):
+    for path in (marked_up / "out").rglob("*.json"):
+        json.loads(path.read_text(encoding="utf-8"))
+    scene = marked_up / "out" / "naïve ж 漢"
+    report = json.loads((scene / "report.json").read_text(encoding="utf-8"))
+    assert MARKUP in report["materials"]
+    assert report["bands"][0] == f"{MARKUP}1"
+    corrected = rasters.describe(scene / "corrected.tif")
+    assert corrected.tags["NOTE"] == MARKUP
+    assert corrected.names[1] == f"{MARKUP}2"
+    assert (scene / "quicklook.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_stac_of_hostile_texts_is_valid_and_its_links_lead_to_the_files(marked_up):
+    import pystac
+
+    out = marked_up / "out"
+    collection = pystac.Collection.from_file(str(out / "collection.json"))
+    paths = [out / unquote(link.href) for link in collection.get_links("item")]
+    items = [pystac.Item.from_file(str(path)) for path in paths]
+    assert {item.id for item in items} == {"a & b '[red]' {0}%s", "naïve ж 漢"}
+    for item in items:
+        assert all((out / item.id / unquote(asset.href)).is_file() for asset in item.assets.values())
+
+
+def test_nothing_is_written_outside_of_the_output_folder(marked_up):
+    made = {path.name for path in marked_up.iterdir()}
+    image = f"a{MARKUP.replace('/', '')}.tif"
+    assert made == {"city.toml", "class_map.tif", "dsm.tif", "own.toml", "out", image}
+    scenes = {path.name for path in (marked_up / "out").iterdir() if path.is_dir() and not path.name.startswith(".")}
+    assert scenes == {"a & b '[red]' {0}%s", "naïve ж 漢"}
+
+
+def run_cli(*arguments):
+    """A process of the command line with a terminal's width."""
+    command = [sys.executable, "-m", "tscorr", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_a_terminal_is_not_obeyed_by_names_and_values(marked_up, tmp_path):
+    done = run_cli("run", marked_up / "city.toml")
+    assert done.returncode == 0
+    text = "\x1b[2J[bold red]"
+    (tmp_path / "city.toml").write_text(f'title = 1\n[scenes]\n"{text.replace(chr(27), chr(92) + "u001b")}" = 3\n')
+    refused = run_cli("plan", tmp_path / "city.toml")
+    assert refused.returncode == 2
+    (tmp_path / "own.toml").write_text(
+        f"[tiles]\nsource = {json.dumps(text)}\nt0 = 0.02\nt1 = 0.2\nw = 0.04\nn = 1.7\n"
+    )
+    listed = run_cli("materials", "--library", tmp_path / "own.toml")
+    assert "[2J[bold red]" in listed.stdout
+    for shown in (done.stdout, done.stderr, refused.stderr, listed.stdout):
+        assert "\x1b" not in shown
+        assert "Traceback" not in shown
+
+
+def test_the_progress_of_a_scene_shows_its_name_and_not_its_markup(capsys):
+    from types import SimpleNamespace
+
+    from tscorr.cli.scenes import progress_bars
+
+    scene = SimpleNamespace(name="[/bold]a[red]", image=SimpleNamespace(shape=(2, 3)))
+    with progress_bars(enabled=True) as progress:
+        progress(scene)(6)
+    assert "[/bold]a[red]" in capsys.readouterr().err

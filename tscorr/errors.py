@@ -12,9 +12,18 @@ Every message names the thing, its value, what is allowed, and the file.
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+LONGEST_LINE = 1000
+
 
 class TscorrError(Exception):
-    """Any error that tscorr raises on purpose; its text is fit for the user's eyes."""
+    """Any error that tscorr raises on purpose; its text is fit for the user's eyes.
+
+    Names and values from files stand in it: control characters are written out, and the middle of a line that
+    is too long is left out.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__("\n".join(_shortened(printable(line)) for line in message.splitlines()))
 
 
 class ConfigError(TscorrError):
@@ -31,6 +40,15 @@ class InputError(TscorrError):
 
 class OutputError(TscorrError):
     """A result could not be written or published."""
+
+
+def printable(text: str) -> str:
+    """A text with control characters written out: a terminal obeys some of them."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode() for c in text)
+
+
+def _shortened(line: str) -> str:
+    return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tscorr.errors import MaterialError, nearest
+from tscorr.texts import read_text
 
 Array = NDArray[np.float64]
 
 PARAMETERS = ("t0", "t1", "w", "n", "k")
+LONGEST_NAME = 100
 FITTED = ("t0", "t1", "w", "n")
 """The order of a covariance matrix: k is held fixed in a fit."""
 
@@ -112,11 +114,7 @@ def load_materials(path: str | Path) -> dict[str, Material]:
     ['delft_roof_tile', 'delft_red_concrete']
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise MaterialError(f"the material library {path} cannot be read: {error}") from None
-    return parse_materials(text, str(path))
+    return parse_materials(read_text(path, "material library", MaterialError), str(path))
 
 
 def parse_materials(text: str, file: str) -> dict[str, Material]:
@@ -157,6 +155,8 @@ def material(name: str) -> Material:
 
 def _material(name: str, table: Any, file: str) -> Material:
     where = f"{file} [{name}]"
+    if not name.isprintable() or not 0 < len(name) <= LONGEST_NAME:
+        raise MaterialError(f"{where}; allowed is a name of 1 to {LONGEST_NAME} printable characters")
     if not isinstance(table, dict):
         raise MaterialError(f"{where} is {table!r}; a material is a table")
     known = {f.name for f in fields(Material)} - {"name", "file"}

@@ -5,10 +5,13 @@ configuration, 3 all failed, 130 interrupted, 143 terminated. Heavy modules are 
 them.
 """
 
+import sys
+
 import click
 
 from tscorr import __version__
 from tscorr.cli import model, scenes, start, surfaces
+from tscorr.cli.common import without_log_of_rubbish
 
 COMMANDS = (
     start.init,
@@ -37,4 +40,5 @@ for command in COMMANDS:
 
 def main() -> None:
     """Entry point of the command `tscorr`."""
+    sys.unraisablehook = without_log_of_rubbish
     cli(prog_name="tscorr")

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from tscorr.errors import ConfigError, TscorrError
+from tscorr.errors import ConfigError, TscorrError, printable
 
 BAD_USAGE = 2
 SIGNALLED = 128
@@ -78,6 +78,15 @@ library_option = click.option(
 )
 
 
+def without_log_of_rubbish(fault: Any) -> None:
+    """Python's report of a fault that cannot be raised, but for one: GDAL quotes the rubbish of a broken file.
+
+    rasterio's log cannot decode that; the error itself is raised and told.
+    """
+    if fault.object != "rasterio._env.log_error":
+        sys.__unraisablehook__(fault)
+
+
 def percent(share: float | None) -> str:
     """A share as text."""
     if share is None:
@@ -87,6 +96,7 @@ def percent(share: float | None) -> str:
 
 def print_table(rows: Sequence[Sequence[str]], left: int = 2) -> None:
     """Columns side by side, the first `left` to the left, numbers to the right."""
+    rows = [[printable(cell) for cell in row] for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for row in rows:
         cells = [

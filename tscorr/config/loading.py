@@ -2,6 +2,7 @@
 
 import os
 import tomllib
+import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 
 from tscorr.config.sections import SURFACES, TABLES, VIEWS, Config, Scene
 from tscorr.errors import ConfigError, nearest
+from tscorr.texts import read_text
 
 
 def load_config(path: str | Path) -> Config:
@@ -19,9 +21,7 @@ def load_config(path: str | Path) -> Config:
     """
     path = Path(path)
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the configuration {path} cannot be read: {error}") from None
+        data = tomllib.loads(read_text(path, "configuration", ConfigError))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path} is not a TOML file: {error}") from None
     try:
@@ -44,16 +44,13 @@ def load_config(path: str | Path) -> Config:
 
 def _expanded(scene: Scene, folder: Path, config: Path) -> Iterator[Scene]:
     """The scene of each image that a glob matches, with {stem} and {parent} filled in and absolute paths."""
-    pattern = Path(scene.image)
-    if any(c in scene.image for c in "*?["):
-        anchor = Path(pattern.anchor) if pattern.is_absolute() else folder
-        images = sorted(anchor.glob(str(pattern.relative_to(pattern.anchor))))
-        if not images:
-            raise ConfigError(f"{config}: no image matches {scene.image}")
+    one = absolute(folder, scene.image)
+    if any(c in scene.image for c in "*?[") and not one.exists():
+        images = _matches(scene.image, folder, config)
         if scene.name is not None and len(images) > 1:
             raise ConfigError(f"{config}: the name '{scene.name}' cannot serve {len(images)} images; leave it out")
     else:
-        images = [absolute(folder, scene.image)]
+        images = [one]
     for image in images:
         words = {"stem": image.stem, "parent": str(image.parent)}
         filled = _with_paths(scene.model_dump(), folder, words)
@@ -63,9 +60,37 @@ def _expanded(scene: Scene, folder: Path, config: Path) -> Iterator[Scene]:
             raise ConfigError("\n".join(_problem(config, item) for item in error.errors())) from None
 
 
+def _matches(pattern: str, folder: Path, config: Path) -> list[Path]:
+    """Images that a pattern matches, in the order of their names."""
+    whole = absolute(folder, pattern)
+    try:
+        images = sorted(Path(whole.anchor).glob(str(whole.relative_to(whole.anchor))))
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"{config}: image = {pattern!r} is no pattern of paths: {error}") from None
+    if not images:
+        raise ConfigError(f"{config}: no image matches {pattern}")
+    return [absolute(folder, str(image)) for image in images]
+
+
+LONGEST_PART = 255
+"""bytes of a file's name that file systems take"""
+
+
 def absolute(folder: Path, path: str) -> Path:
-    """A path of the file, which is relative to the file's folder, without `..` in it."""
+    """A path of the file, which is relative to the file's folder, without `..` in it.
+
+    Raises ConfigError where no file can have this path, or where it would garble what it is printed on.
+    """
+    long = any(len(os.fsencode(part)) > LONGEST_PART for part in Path(path).parts)
+    if long or not path.isprintable() or len(os.fsencode(path)) > PATH_MAX:
+        raise ConfigError(
+            f"the path {path!r} can be of no file; allowed are printable characters, at most {LONGEST_PART} bytes "
+            f"in a name and {PATH_MAX} in all"
+        )
     return Path(os.path.normpath(folder / path))
+
+
+PATH_MAX = 2000
 
 
 PATHS = {
@@ -94,9 +119,14 @@ def _with_paths(value: Any, folder: Path, words: Mapping[str, str], key: str = "
 
 
 def _require_distinct(names: list[str], config: Path) -> None:
+    """Folders of scenes must differ on file systems, too, that know no case or spell é in two ways."""
+    known: dict[str, str] = {}
     for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(f"{config}: two scenes are called '{name}'; give them a name each")
+        folder = unicodedata.normalize("NFC", name).casefold()
+        if (other := known.get(folder)) is not None:
+            called = f"two scenes are called '{name}'" if name == other else f"'{other}' and '{name}' are one folder"
+            raise ConfigError(f"{config}: {called}; give them a name each")
+        known[folder] = name
 
 
 def _problem(path: Path, item: Mapping[str, Any]) -> str:

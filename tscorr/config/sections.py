@@ -255,6 +255,15 @@ class Truth(Section):
     sunlit: str = Field(description="1 where the sun shines")
 
 
+LONGEST_NAME = 100
+"""bytes of a scene's name: its folder has a longer one while it is made"""
+UNFIT = set('/\\<>:"|?*')
+"""no folder can have them in its name on Linux or Windows"""
+TOP_FILES = {"batch.json", "batch.log", "index.html", "collection.json"}
+DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(1, 10))}
+"""names that Windows keeps for itself, with any ending"""
+
+
 class Scene(Section):
     """[[scenes]]: one image, or a glob of images that share their settings."""
 
@@ -282,8 +291,15 @@ class Scene(Section):
     @field_validator("name")
     @classmethod
     def _safe_name(cls, name: str | None) -> str | None:
-        if name is not None and (not name.strip(". ") or len(name) > 100 or any(c in name for c in "/\\\0\n<>")):
-            raise ValueError("a name is a folder: 1 to 100 characters without / \\ < >, not only dots")
+        if name is None:
+            return None
+        fits = 0 < len(name.encode()) <= LONGEST_NAME and name.isprintable() and not set(name) & UNFIT
+        taken = name.lower() in TOP_FILES or name.partition(".")[0].lower() in DEVICES
+        if not fits or taken or name != name.strip(". "):
+            raise ValueError(
+                f"a name is a folder on any system: 1 to {LONGEST_NAME} bytes of printable characters without "
+                f"{' '.join(sorted(UNFIT))}, no dot or space at its ends, and not taken, as con or batch.json are"
+            )
         return name
 
 

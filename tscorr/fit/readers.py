@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tscorr.errors import InputError, nearest
 from tscorr.fit.measurements import Measurements
+from tscorr.texts import read_text
 
 Array = NDArray[np.float64]
 
@@ -48,11 +49,7 @@ def read_measurements(path: str | Path) -> Measurements:
     readers = {".csv": _read_csv, ".brdf": _read_cornell}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path} is neither .csv nor .brdf; these are the measurements that can be read")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"the measurements {path} cannot be read: {error}") from None
-    return readers[path.suffix.lower()](text, str(path))
+    return readers[path.suffix.lower()](read_text(path, "file of measurements"), str(path))
 
 
 class _Column(NamedTuple):

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import rasterio
 from rasterio.enums import ColorInterp, Interleaving
-from rasterio.errors import RasterioError
 from rasterio.warp import transform_bounds
 
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
 from tscorr.rasters import envi
 from tscorr.rasters.envi import PixelByPixel
-from tscorr.rasters.sound import check_sound, open_dataset
+from tscorr.rasters.sound import GDAL_ERRORS, check_sound, open_dataset
 
 IMAGE_TYPES = ("uint8", "int16", "uint16", "float32")
 TILE_BYTES = 8e6
@@ -81,7 +80,7 @@ def opened(path: Path, *, ours: bool = False) -> Iterator[Any]:
     try:
         with rasterio.Env(**ENVIRONMENT), open_dataset(path, ours=ours) as dataset:
             yield dataset
-    except RasterioError as error:
+    except GDAL_ERRORS as error:
         raise InputError(f"{path} cannot be read: {reason_of(error, path)}") from None
 
 
@@ -163,7 +162,10 @@ def _profile(dataset: Any) -> dict[str, Any]:
 
 def _names(dataset: Any, fields: Mapping[str, str]) -> tuple[str, ...]:
     """Names of the bands; those of an ENVI header without the wavelengths that GDAL appends."""
-    given = envi.items(fields, "band_names", dataset.count) or dataset.descriptions
+    try:
+        given = envi.items(fields, "band_names", dataset.count) or dataset.descriptions
+    except UnicodeDecodeError:  # then numbers must do
+        given = (None,) * dataset.count
     return tuple(name or f"band {i}" for i, name in enumerate(given, start=1))
 
 

@@ -9,14 +9,13 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
-from rasterio.errors import RasterioError
 from rasterio.vrt import WarpedVRT
 
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
 from tscorr.rasters.envi import PixelByPixel
 from tscorr.rasters.header import ENVIRONMENT, RasterInfo, opened, reason_of
-from tscorr.rasters.sound import open_dataset
+from tscorr.rasters.sound import GDAL_ERRORS, open_dataset
 
 Array = NDArray[Any]
 
@@ -61,7 +60,7 @@ class Reader:
         """Stored values of a block: (bands, rows, cols), or (rows, cols) of one band."""
         try:
             return self._read(block, bands)
-        except RasterioError as error:
+        except GDAL_ERRORS as error:
             place = f"rows {block.row} to {block.row + block.height}, columns {block.col} to {block.col + block.width}"
             raise InputError(
                 f"{self.info.path} cannot be read at {place}: {reason_of(error, self.info.path)}"

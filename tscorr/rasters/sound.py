@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import rasterio
+from rasterio._err import CPLE_BaseError
 from rasterio.enums import Interleaving, MaskFlags
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
@@ -25,6 +26,8 @@ DRIVERS = ("GTiff", "ENVI", "HFA", "JP2OpenJPEG", "PNG", "JPEG", "AAIGrid", "EHd
 RESULTS = ("GTiff", "VRT", "ENVI")
 """formats that are written"""
 NUMBERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64")
+GDAL_ERRORS = (RasterioError, CPLE_BaseError)
+"""rasterio passes some errors of GDAL on as they are"""
 LARGEST_TILE_BYTES = 256e6
 MOST_PIXELS = 1e11
 LONGEST_SIDE = 10_000_000
@@ -47,7 +50,7 @@ def open_dataset(path: Path, *, ours: bool = False, **options: Any) -> Any:
     for driver in RESULTS if ours else DRIVERS:
         try:
             return rasterio.open(path, driver=driver, sharing=False, **options)
-        except RasterioError as error:
+        except GDAL_ERRORS as error:
             reasons.append(str(error.__cause__ or error))
     known = [reason for reason in reasons if "not recognized as being in a supported" not in reason]
     raise RasterioError(known[0] if known else f"it is in none of the formats {', '.join(DRIVERS)}")
@@ -182,7 +185,7 @@ def _pages(file: Path, driver: str) -> Iterator[Any]:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)  # overviews and masks have no place
                 page = rasterio.open(name, driver=driver, sharing=False)
-        except RasterioError as error:
+        except GDAL_ERRORS as error:
             if number == 1:
                 raise InputError(
                     f"{file} cannot be read: {error.__cause__ or error}; allowed is a file of the format {driver}"

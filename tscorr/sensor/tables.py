@@ -1,11 +1,13 @@
 """Tables of positions: CSV whose columns have names."""
 
 import csv
+import io
 from pathlib import Path
 
 import numpy as np
 
 from tscorr.errors import InputError
+from tscorr.texts import read_text
 
 Rows = list[tuple[int, dict[str, str]]]
 
@@ -15,13 +17,12 @@ def read_columns(path: Path, needed: tuple[str, ...], what: str) -> tuple[Rows, 
 
     Raises InputError where the file cannot be read or lacks a column that is needed.
     """
+    reader = csv.DictReader(io.StringIO(read_text(path, what)))
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            names = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = names
-            rows = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        names = [name.strip() for name in reader.fieldnames or []]
+        reader.fieldnames = names
+        rows = [(reader.line_num, row) for row in reader]
+    except csv.Error as error:
         raise InputError(f"the {what} {path} cannot be read: {error}") from None
     missing = [name for name in needed if name not in names]
     if missing:
