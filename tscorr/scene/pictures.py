@@ -2,14 +2,16 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tscorr import quicklook, rasters
 from tscorr.errors import InputError
-from tscorr.scene.plan import Scene
+
+if TYPE_CHECKING:
+    from tscorr.scene.plan import Scene
 
 Array = NDArray[Any]
 
@@ -21,7 +23,7 @@ BANDS_AT_ONCE = 8
 """bands of one file are read together: where they are stored together, each piece is then decoded once"""
 
 
-def draw_quicklook(scene: Scene, folder: Path) -> Path:
+def draw_quicklook(scene: "Scene", folder: Path) -> Path:
     """The picture of before, after and flags, of a scene that is being published."""
     image = scene.image
     wavelengths = _good(scene.wavelengths_um, image)
