@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def planned(folder, name, **changes):
 
 def cut_of(scene, order=(2, 0, 1)):
     """The strips of a scene, done but not joined."""
-    cut = strips.Strips(scene, SPLIT_MPIXEL, correct.resume_key(scene))
+    cut = strips.Strips(scene, SPLIT_MPIXEL)
     strips.prepare(cut)
     for number in order:
         strips.correct_strip(cut, number)
@@ -194,14 +195,21 @@ def test_sums_survive_their_way_through_json(inputs):
 
 @pytest.mark.parametrize(("split_mpixel", "rows"), [(400, [1296]), (0.066, [1024, 272]), (1e-6, [512, 512, 272])])
 def test_strips_are_whole_rows_of_units(inputs, split_mpixel, rows):
-    cut = strips.Strips(planned(inputs, "none"), split_mpixel, "key")
+    cut = strips.Strips(planned(inputs, "none"), split_mpixel)
     assert [block.height for block in cut.blocks] == rows
     assert sum(block.height * block.width for block in cut.blocks) == 1296 * 64
 
 
+def test_envi_files_are_not_cut(inputs):
+    scene = planned(inputs, "envi")
+    output = scene.config.output.model_copy(update={"format": "envi"})
+    scene = replace(scene, config=scene.config.model_copy(update={"output": output}))
+    assert len(strips.Strips(scene, SPLIT_MPIXEL).blocks) == 1
+
+
 def test_strips_of_another_version_of_the_result_are_cleared(inputs):
     scene = planned(inputs, "cleared")
-    mine = strips.Strips(scene, SPLIT_MPIXEL, correct.resume_key(scene)).folder
+    mine = strips.Strips(scene, SPLIT_MPIXEL).folder
     others = [mine.with_name(".roofs.000000000000-512.strips"), mine.with_name(".roofs2.0000-512.strips")]
     for folder in (mine, *others):
         folder.mkdir(parents=True)

@@ -1,8 +1,8 @@
 """Many scenes: plan all, then correct one after the other; resume what is done, go on where one fails.
 
 `planning` checks all scenes before work starts, `lock` keeps a second batch out of the output folder, `local` corrects
-the scenes on this machine, `overview` writes what stands at the top of the folder, `runner` puts them together, and
-`outcome` is what comes back.
+the scenes on this machine, `cluster` has the workers of a Dask cluster do the `tasks`, `overview` writes what stands
+at the top of the folder, `runner` puts them together, and `outcome` is what comes back.
 """
 
 from tscorr.batch.outcome import BatchResult, SceneOutcome, SceneProgress, silent_scene

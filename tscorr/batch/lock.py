@@ -66,6 +66,7 @@ def _hold(path: Path) -> int:
             if _is(descriptor, path):
                 os.ftruncate(descriptor, 0)
                 os.pwrite(descriptor, json.dumps(_myself()).encode(), 0)
+                os.fsync(descriptor)  # a cluster's workers read it over the network
                 return descriptor
         except BaseException:
             os.close(descriptor)

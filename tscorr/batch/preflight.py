@@ -1,6 +1,7 @@
 """What the machine must have for a batch, looked at before any work starts."""
 
 import logging
+import math
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -43,7 +44,8 @@ def _partial(todo: Sequence[Scene]) -> Iterator[TscorrError]:
 
 def _memory(todo: Sequence[Scene]) -> Iterator[TscorrError]:
     """The limit must hold the smallest block of each image, and the machine the limit."""
-    free_mb = available_mb()
+    elsewhere = any(scene.config.run.scheduler is not None for scene in todo)
+    free_mb = math.inf if elsewhere else available_mb()
     for scene in todo:
         need_mb, limit_mb = memory_mb(scene), scene.config.run.memory_limit_mb
         if need_mb > limit_mb:

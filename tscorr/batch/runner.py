@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tscorr import config, publish
-from tscorr.batch.local import outcomes
+from tscorr.batch import cluster, local
 from tscorr.batch.lock import locked
 from tscorr.batch.outcome import BatchResult, SceneProgress, silent_scene
 from tscorr.batch.overview import write_overview
@@ -21,12 +21,14 @@ def run(
     scenes: Sequence[str] = (),
     materials: Sequence[str] = (),
     workers: int | None = None,
+    scheduler: str | None = None,
     overwrite: bool = False,
     progress: SceneProgress = silent_scene,
 ) -> BatchResult:
     """Correct the scenes of a configuration.
 
     settings  : a configuration, or the path of one.
+    scheduler : address of a Dask scheduler, in place of that of the configuration.
     overwrite : recompute scenes whose published result is current.
     Raises ConfigError, MaterialError or InputError before any work starts, OutputError where another batch is at work
     in the folder; later errors fail their scene.
@@ -37,13 +39,14 @@ def run(
     """
     if not isinstance(settings, config.Config):
         settings = config.load_config(settings)
-    if workers is not None:
-        settings = settings.model_copy(update={"run": settings.run.model_copy(update={"workers": workers})})
+    given = {key: value for key, value in (("workers", workers), ("scheduler", scheduler)) if value is not None}
+    settings = settings.model_copy(update={"run": settings.run.model_copy(update=given)})
     planned = plan(settings, scenes, materials, to_run=True, overwrite=overwrite)
     folder = Path(settings.output.directory)
     with locked(folder), _log_file(folder):
         for deed in publish.recover(folder):
             log.warning("%s", deed)
+        outcomes = local.outcomes if settings.run.scheduler is None else cluster.outcomes
         result = BatchResult(folder, tuple(outcomes(planned, overwrite, progress)))
         write_overview(settings, result, planned)
     return result

@@ -20,18 +20,31 @@ if TYPE_CHECKING:
 @click.option("--scene", "scenes", multiple=True, metavar="NAME", help="Only this scene; may be repeated.")
 @click.option("--material", "materials", multiple=True, metavar="NAME", help="Correct only this material.")
 @click.option("--workers", type=click.IntRange(0, 256), help="Threads; 0 for all cores.")
+@click.option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster that does the work: tcp://host:port.")
 @click.option("--overwrite", is_flag=True, help="Recompute scenes whose result is current.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress and no table.")
 @with_clear_errors
 def run(
-    config: Path, scenes: Sequence[str], materials: Sequence[str], workers: int | None, overwrite: bool, quiet: bool
+    config: Path,
+    scenes: Sequence[str],
+    materials: Sequence[str],
+    workers: int | None,
+    scheduler: str | None,
+    overwrite: bool,
+    quiet: bool,
 ) -> None:
     """Correct the scenes of CONFIG; scenes whose result is current are left as they are."""
     from tscorr import batch
 
     with progress_bars(enabled=not quiet and sys.stderr.isatty()) as progress:
         result = batch.run(
-            config, scenes=scenes, materials=materials, workers=workers, overwrite=overwrite, progress=progress
+            config,
+            scenes=scenes,
+            materials=materials,
+            workers=workers,
+            scheduler=scheduler,
+            overwrite=overwrite,
+            progress=progress,
         )
     if not quiet:
         print_outcome(result)

@@ -105,6 +105,12 @@ class Run(Section):
     workers: Annotated[int, Field(ge=0, le=256)] = Field(0, description="0: all cores")
     memory_limit_mb: Annotated[int, Field(ge=128)] = Field(450, description="bound on the memory of a scene")
     skip: bool = Field(True, description="false computes everything: for checking")
+    scheduler: str | None = Field(
+        None, description="address of a Dask scheduler, whose workers do the batch", examples=["tcp://host:8786"]
+    )
+    split_mpixel: Annotated[float, Field(gt=0)] = Field(
+        400, description="on a cluster, scenes with more pixels than this [millions] are done in strips"
+    )
 
 
 class Materials(Section):

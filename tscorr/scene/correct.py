@@ -83,20 +83,16 @@ def target_of(scene: Scene) -> Path:
     return Path(scene.config.output.directory) / scene.name
 
 
-def correct_scene(scene: Scene, progress: Progress = silent, key: str | None = None) -> dict[str, Any]:
-    """Correct a scene and publish its folder; the content of its report.json.
-
-    key : the scene's resume key where the inputs are known by other paths; default: as they were when it was planned.
-    """
+def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
+    """Correct a scene and publish its folder; the content of its report.json."""
     started = time.perf_counter()
-    key = key or resume_key(scene)
     with closing(scene), publish.Publication(target_of(scene)) as publication:
         pipeline = Pipeline(scene, publication.folder)
         pipeline.run(progress)
-        return finish(scene, publication, pipeline.sums, time.perf_counter() - started, key)
+        return finish(scene, publication, pipeline.sums, time.perf_counter() - started)
 
 
-def finish(scene: Scene, publication: publish.Publication, sums: Sums, wall_s: float, key: str) -> dict[str, Any]:
+def finish(scene: Scene, publication: publish.Publication, sums: Sums, wall_s: float) -> dict[str, Any]:
     """Write what stands beside the rasters of a scene, and publish; the content of its report.json."""
     folder = publication.folder
     facts = facts_of(scene, sums, wall_s)
@@ -121,7 +117,7 @@ def finish(scene: Scene, publication: publish.Publication, sums: Sums, wall_s: f
         {
             "scene": scene.name,
             "tscorr": __version__,
-            "key": key,
+            "key": resume_key(scene),
             "materials": list(scene.only),
             "products": products_of(scene),
             "inputs": hashes,

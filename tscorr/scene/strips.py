@@ -23,9 +23,8 @@ import numpy as np
 
 from tscorr import publish, rasters
 from tscorr.correction import Corrector, add_tally, new_tally
-from tscorr.errors import ConfigError
 from tscorr.grid import Block, blocks
-from tscorr.scene.correct import finish, peak_rss_mb, target_of
+from tscorr.scene.correct import check_unchanged, finish, peak_rss_mb, resume_key, target_of
 from tscorr.scene.ground import Ground
 from tscorr.scene.plan import Scene
 from tscorr.scene.run import Pipeline, Progress, Sums, silent, units
@@ -39,16 +38,21 @@ class Strips:
 
     scene: Scene
     split_mpixel: float
-    key: str
-    """the scene's resume key"""
+
+    @property
+    def key(self) -> str:
+        """The scene's resume key."""
+        return resume_key(self.scene)
 
     @property
     def blocks(self) -> list[Block]:
         """Whole rows of units of at most `split_mpixel`, or one row of units; they cover each pixel once.
 
-        Their edges are those of the image's tiles.
+        Their edges are those of the image's tiles. One for all where files of the format cannot be joined: ENVI.
         """
         rows, cols = self.scene.image.shape
+        if self.scene.config.output.format == "envi":
+            return [Block(0, 0, rows, cols)]
         unit = units(self.scene.image, self.scene.config.run.memory_limit_mb, workers=1)[0].height
         most = max(unit, int(self.split_mpixel * 1e6 / cols) // unit * unit)
         equal = -(-rows // -(-rows // most))
@@ -85,8 +89,6 @@ def clear(scene: Scene, keep: Path | None = None) -> None:
 def prepare(strips: Strips) -> None:
     """Sweep the whole scene for what is in shadow or hidden, and keep the masks for its strips."""
     scene, masks = strips.scene, strips.folder / MASKS
-    if scene.config.output.format == "envi":
-        raise ConfigError("[output] format = 'envi' cannot be cut into strips; allowed are 'gtiff' and 'cog'")
     if masks.exists():
         return
     unfinished = masks.with_name(f"{MASKS}.{uuid4().hex[:8]}.part")
@@ -106,7 +108,8 @@ def prepare(strips: Strips) -> None:
 def correct_strip(strips: Strips, number: int, progress: Progress = silent) -> None:
     """Correct one strip and keep its rasters and sums."""
     scene, part, strip = strips.scene, strips.part(number), strips.blocks[number]
-    if publish.is_current(part, strips.key):
+    products = scene.config.output.products
+    if publish.is_current(part, strips.key, products):
         progress(strip.height * strip.width)
         return
     with closing(scene), publish.Publication(part) as publication:
@@ -114,7 +117,8 @@ def correct_strip(strips: Strips, number: int, progress: Progress = silent) -> N
         pipeline.run(progress)
         sums = json.dumps(plain_sums(pipeline.sums))
         (publication.folder / SUMS).write_text(sums, encoding="utf-8")
-        publication.commit({"key": strips.key})
+        check_unchanged(scene)
+        publication.commit({"key": strips.key, "products": list(products)})
 
 
 def join(strips: Strips, wall_s: float) -> dict[str, Any]:
@@ -130,7 +134,7 @@ def join(strips: Strips, wall_s: float) -> dict[str, Any]:
             for part, file in zip(parts, files, strict=True):
                 _link(part / f"{product}.tif", file)
             rasters.join_rows(files, publication.folder / f"{product}.vrt")
-        report = finish(scene, publication, sums, wall_s, strips.key)
+        report = finish(scene, publication, sums, wall_s)
     shutil.rmtree(strips.folder, ignore_errors=True)
     return report
 
