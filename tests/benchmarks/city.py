@@ -85,16 +85,17 @@ def make_city(folder, rows, cols, *, bands=4, codec="none", interleave="pixel", 
             class_map.write(classes, 1, window=window)
             surface.write(np.round(heights, 3), 1, window=window)
             diffuse = level[classes] * brightness
-            for first in range(0, bands, 4):
-                some = colours[first : first + 4, None, None]
+            at_once = bands if interleave == "pixel" else 4
+            for first in range(0, bands, at_once):
+                some = colours[first : first + at_once, None, None]
                 values = diffuse * some + NOISE * rng.standard_normal((len(some), *diffuse.shape), np.float32)
                 stored = np.clip(values / SCALE + 0.5, 1, 65535).astype(np.uint16)
                 image.write(stored, list(range(first + 1, first + 1 + len(some))), window=window)
     return path
 
 
-def write_config(image, *, flat=False, shadows=False, products=("corrected", "flags"), quicklook=False, **run):
-    """A configuration of the city beside its image; its path. `run` goes into [run]."""
+def write_config(image, *, flat=False, shadows=False, products=("corrected", "flags"), quicklook=False, form="gtiff", **run):
+    """A configuration of the city beside its image; its path. `run` goes into [run], `form` is that of the files."""
     with rasterio.open(image) as file:
         rows, cols = file.shape
     side_m = CELL_M * max(rows, cols)
@@ -113,6 +114,7 @@ def write_config(image, *, flat=False, shadows=False, products=("corrected", "fl
             "directory": str(image.with_name("out")),
             "products": list(products),
             "quicklook": quicklook,
+            "format": form,
         },
         "run": run,
         "materials": {"classes": {str(value): name for value, name in MATERIALS.items()}},
