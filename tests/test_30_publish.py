@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -37,6 +38,43 @@ def test_a_committed_folder_has_its_files_and_a_manifest_of_their_hashes(tmp_pat
         "b.txt": {"sha256": hashlib.sha256(b"b").hexdigest(), "bytes": 1},
     }
     assert leftovers(tmp_path / "out") == []
+
+
+def test_files_that_are_hashed_early_have_the_same_entries(tmp_path):
+    with publish.Publication(tmp_path / "out") as publication:
+        (publication.folder / "a.txt").write_bytes(b"a" * 3_000_000)
+        publication.hash_early([publication.folder / "a.txt"])
+        (publication.folder / "b.txt").write_bytes(b"b")
+        publication.commit({})
+    outputs = json.loads((tmp_path / "out" / publish.MANIFEST).read_text())["outputs"]
+    assert outputs["a.txt"]["sha256"] == hashlib.sha256(b"a" * 3_000_000).hexdigest()
+    assert outputs["b.txt"]["sha256"] == hashlib.sha256(b"b").hexdigest()
+    assert publish.damaged(tmp_path / "out") == []
+
+
+def test_inputs_are_hashed_beside_other_work(tmp_path):
+    paths = [tmp_path / name for name in "ab"]
+    for path in paths:
+        path.write_bytes(path.name.encode() * 3_000_000)
+    with publish.EarlyHashes(paths) as hashes:
+        assert hashes.entries() == {
+            str(path): {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in paths
+        }
+
+
+def test_an_input_that_is_gone_is_an_error_where_its_hash_is_asked_for(tmp_path):
+    with publish.EarlyHashes([tmp_path / "nix"]) as hashes, pytest.raises(FileNotFoundError, match="nix"):
+        hashes.entries()
+
+
+def test_work_that_fails_does_not_wait_for_the_hashes_of_its_inputs(tmp_path):
+    path = tmp_path / "large"
+    path.touch()
+    os.truncate(path, 200 << 30)  # minutes of hashing, and no disk
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match="at once"), publish.EarlyHashes([path, path]):
+        raise ValueError("at once")
+    assert time.perf_counter() - start < 5
 
 
 def test_work_is_done_beside_the_target_on_its_file_system(tmp_path):

@@ -358,6 +358,33 @@ def test_an_infinite_value_is_no_value_when_decimated(tmp_path):
     assert np.count_nonzero(np.isnan(result)) == 2
 
 
+def test_samples_of_a_small_raster_are_all_of_it(tmp_path):
+    values = np.random.default_rng(14).uniform(0, 9, (64, 96)).astype(np.float32)
+    values[3, 4], values[5, 6] = np.nan, -9999
+    info = rasters.describe(write_raster(tmp_path / "x.tif", values, nodata=-9999))
+    samples = rasters.read_samples(info, 3, 32)
+    finite = np.delete(values.ravel(), [3 * 96 + 4, 5 * 96 + 6])
+    np.testing.assert_array_equal(np.sort(samples), np.sort(finite))
+
+
+@pytest.mark.parametrize("tile", [16, 64, 128])
+def test_samples_of_a_large_raster_are_spread_over_it_and_decode_few_tiles(tmp_path, tile):
+    rows, cols = np.indices((700, 900)).astype(np.float32)
+    shape = {"blockxsize": tile, "blockysize": tile}
+    row, col = (
+        rasters.read_samples(rasters.describe(write_raster(tmp_path / "x.tif", axis, **shape)), 4, 32)
+        for axis in (rows, cols)
+    )
+    assert row.size == 16 * 32 * 32
+    for places, length in ((row, 700), (col, 900)):
+        assert places.min() == 0
+        assert places.max() >= length - 1 - tile
+        quarters = np.bincount((places * 4 // length).astype(int), minlength=4)
+        assert quarters.min() > 0
+    tiles = set(zip((row // tile).tolist(), (col // tile).tolist(), strict=True))
+    assert len(tiles) <= 16 * max(1, 3 * 3 if tile < 32 else 1)
+
+
 def test_decimated_flags_are_flags_that_exist(tmp_path):
     flags = np.random.default_rng(10).choice(np.array([1, 64, 2050], np.uint16), (64, 96))
     info = rasters.describe(write_raster(tmp_path / "x.tif", flags))

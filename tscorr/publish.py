@@ -10,8 +10,10 @@ import json
 import os
 import re
 import shutil
+import threading
 import uuid
 from collections.abc import Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,6 +21,8 @@ from tscorr.errors import InputError, OutputError
 
 MANIFEST = "manifest.json"
 SEAL = "manifest_sha256"
+HASHING_THREADS = 2
+READ_BYTES = 1 << 20
 HIDDEN = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>part|old)")
 """names of what is being made and of what is being replaced"""
 UNFINISHED = re.compile(r"\..+\.(?:part|old|strips)")
@@ -69,6 +73,8 @@ class Publication:
     def __init__(self, target: Path) -> None:
         self.target = target
         self.folder = hidden_name(target, "part")
+        self._hasher = ThreadPoolExecutor(HASHING_THREADS)
+        self._hashes: dict[Path, Future[str]] = {}
 
     def __enter__(self) -> Self:
         try:
@@ -78,13 +84,22 @@ class Publication:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._hasher.shutdown(cancel_futures=True)
         shutil.rmtree(self.folder, ignore_errors=True)
+
+    def hash_early(self, files: Iterable[Path]) -> None:
+        """Start to hash files of the folder that are whole, while others are still written."""
+        for path in files:
+            self._hashes[path] = self._hasher.submit(sha256, path)
 
     def commit(self, manifest: Mapping[str, Any]) -> None:
         """Write the manifest with the hashes of all files, flush, and take the target's place."""
         try:
             files = sorted(path for path in self.folder.iterdir() if path.name != MANIFEST)
-            outputs = {path.name: {"sha256": sha256(path), "bytes": path.stat().st_size} for path in files}
+            self.hash_early(path for path in files if path not in self._hashes)
+            outputs = {
+                path.name: {"sha256": self._hashes[path].result(), "bytes": path.stat().st_size} for path in files
+            }
             path = self.folder / MANIFEST
             path.write_text(_sealed({**manifest, "outputs": outputs}), encoding="utf-8")
             for file in (*files, path):
@@ -103,10 +118,34 @@ class Publication:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def sha256(path: Path) -> str:
-    """SHA-256 of a file, as hexadecimal digits."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+class EarlyHashes:
+    """SHA-256 of the inputs, found by a thread of its own while they are worked on."""
+
+    def __init__(self, paths: Iterable[Path]) -> None:
+        self._paths = list(paths)
+        self._stop = threading.Event()
+        self._pool = ThreadPoolExecutor(1)
+        self._hashes = [self._pool.submit(sha256, path, self._stop) for path in self._paths]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._pool.shutdown(cancel_futures=True)
+
+    def entries(self) -> dict[str, dict[str, str]]:
+        """The manifest's entry of each path; waits for those that are still being read."""
+        return {str(path): {"sha256": found.result()} for path, found in zip(self._paths, self._hashes, strict=True)}
+
+
+def sha256(path: Path, stop: threading.Event | None = None) -> str:
+    """SHA-256 of a file, as hexadecimal digits; of no more than its beginning once `stop` is set."""
+    digest, buffer = hashlib.sha256(), memoryview(bytearray(READ_BYTES))
+    with path.open("rb", buffering=0) as file:
+        while (size := file.readinto(buffer)) and not (stop is not None and stop.is_set()):
+            digest.update(buffer[:size])
+    return digest.hexdigest()
 
 
 def identities(paths: Iterable[Path]) -> dict[str, dict[str, int]]:

@@ -10,9 +10,11 @@ others use too). Prints the bars beside them.
 
 import argparse
 import shutil
+import sys
 import tempfile
 import time
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -74,7 +76,7 @@ def unpublished():
     """A run that neither hashes nor checks nor flushes what it wrote."""
     with ExitStack() as patches:
         for name, value in (
-            ("tscorr.publish.sha256", lambda _: ""),
+            ("tscorr.publish.sha256", lambda *_: ""),
             ("tscorr.publish.os.fsync", lambda _: None),
             ("tscorr.rasters.writing.checksum", lambda _: 0),
             ("tscorr.rasters.writing._read", lambda *_: b""),
@@ -122,23 +124,23 @@ def ratios(bench, only_codec=None, only_interleave=None):
             continue
         name = {"none": "uncompressed", "zstd": "ZSTD 1", "deflate": "DEFLATE 6"}[codec] + f", by {interleave}"
         with bench.city(codec=codec, interleave=interleave) as image:
-            dsm = write_config(image)
-            flat = shutil.copy(write_config(image, flat=True), image.with_name("flat.toml"))
-            dsm = write_config(image)
+            dsm, flat = write_config(image), write_config(image, name="flat", flat=True)
             share = lobe_share(dsm)
             times = bench.timed(
-                G=lambda: gdal_copy(image),
-                N=lambda: n_run(dsm),
-                run=lambda: run(dsm),
-                bare=lambda: bare_run(dsm),
-                flat=lambda: run(flat),
+                G=partial(gdal_copy, image),
+                N=partial(n_run, dsm),
+                run=partial(run, dsm),
+                bare=partial(bare_run, dsm),
+                flat=partial(run, flat),
             )
         by_pixel = interleave == "pixel"
         over_copy = RUN_OVER_COPY[codec] if by_pixel else None
         yield Ratio(f"{name}: share of pixels in a lobe", share)
         yield ratio(f"{name}: run / N", times["run"], times["N"], most=1.25 if by_pixel else 1.7)
         yield ratio(f"{name}: run / G", times["run"], times["G"], most=over_copy)
-        yield ratio(f"{name}: flat run / G", times["flat"], times["G"], most=FLAT_OVER_COPY[codec] if by_pixel else None)
+        yield ratio(
+            f"{name}: flat run / G", times["flat"], times["G"], most=FLAT_OVER_COPY[codec] if by_pixel else None
+        )
         yield ratio(f"{name}: run that is not published / G", times["bare"], times["G"])
         yield ratio(f"{name}: run / run that is not published", times["run"], times["bare"])
         yield Ratio(f"{name}: G, seconds", times["G"].wall_s, times["G"].cpu_s)
@@ -153,9 +155,9 @@ def lobe_share(config):
 def defaults(bench):
     """With removed, shadows and quicklook; as cloud-optimised GeoTIFF; and what report and quicklook are of a run."""
     with bench.city(codec="zstd") as image:
-        config = {"plain": {}, "defaults": DEFAULTS, "cog": {"form": "cog"}}
-        paths = {name: shutil.copy(write_config(image, **keys), image.with_name(f"{name}.toml")) for name, keys in config.items()}
-        times = bench.timed(G=lambda: gdal_copy(image), **{name: lambda path=path: run(path) for name, path in paths.items()})
+        changes = {"plain": {}, "defaults": DEFAULTS, "cog": {"form": "cog"}}
+        paths = {name: write_config(image, name=name, **keys) for name, keys in changes.items()}
+        times = bench.timed(G=partial(gdal_copy, image), **{name: partial(run, path) for name, path in paths.items()})
         yield ratio("defaults (removed, shadows, quicklook), ZSTD 1 / G", times["defaults"], times["G"])
         yield ratio("defaults / run, ZSTD 1", times["defaults"], times["plain"])
         yield ratio("COG / run, ZSTD 1", times["cog"], times["plain"], most=3.3)
@@ -188,10 +190,8 @@ def workers(bench):
     """One worker against two, on compressed input."""
     for codec in ("zstd", "deflate"):
         with bench.city(codec=codec) as image:
-            paths = [
-                shutil.copy(write_config(image, workers=count), image.with_name(f"{count}.toml")) for count in (1, 2)
-            ]
-            times = bench.timed(one=lambda: run(paths[0]), two=lambda: run(paths[1]))
+            one, two = (write_config(image, name=f"{count}", workers=count) for count in (1, 2))
+            times = bench.timed(one=partial(run, one), two=partial(run, two))
         yield ratio(f"one worker / two workers, {codec}", times["one"], times["two"], least=1.6)
 
 
@@ -208,7 +208,9 @@ def memory(bench):
         with bench.city(codec="zstd", **shape) as image:
             yield Ratio(f"peak memory, {name}, MB", peak_mb(write_config(image)), most=MEMORY_MB)
             if name in {"square", "six times as wide"}:
-                yield Ratio(f"peak memory, {name}, defaults, MB", peak_mb(write_config(image, **DEFAULTS)), most=MEMORY_MB)
+                yield Ratio(
+                    f"peak memory, {name}, defaults, MB", peak_mb(write_config(image, **DEFAULTS)), most=MEMORY_MB
+                )
 
 
 def growth(bench):
@@ -218,20 +220,19 @@ def growth(bench):
         side = int(bench.size * part)
         with bench.city(rows=side, codec="zstd") as image:
             config = write_config(image)
-            per_pixel[side] = bench.timed(run=lambda config=config: run(config))["run"]
+            per_pixel[side] = bench.timed(run=partial(run, config))["run"]
         least = per_pixel[min(per_pixel)]
         of_least = (min(per_pixel) / side) ** 2
         times = per_pixel[side]
         yield Ratio(
-            f"time of a pixel, {side} / {min(per_pixel)} columns", *(
-                of_least * a / b for a, b in ((times.wall_s, least.wall_s), (times.cpu_s, least.cpu_s))
-            )
+            f"time of a pixel, {side} / {min(per_pixel)} columns",
+            *(of_least * a / b for a, b in ((times.wall_s, least.wall_s), (times.cpu_s, least.cpu_s))),
         )
     value = per_pixel[bench.size].cpu_s / bench.size**2 / 4
     for bands, side in ((60, bench.size // 5), (300, bench.size // 10)):
         with bench.city(rows=side, bands=bands, interleave="band", codec="zstd") as image:
             config = write_config(image)
-            times = bench.timed(run=lambda config=config: run(config))["run"]
+            times = bench.timed(run=partial(run, config))["run"]
         yield Ratio(f"CPU time of a value, {bands} / 4 bands", times.cpu_s / side**2 / bands / value)
 
 
@@ -242,8 +243,8 @@ def sight(bench):
     cells = {"cell_x_m": CELL_M, "cell_y_m": CELL_M}
     middle, height_m = side * CELL_M / 2, side * CELL_M * 0.6
 
-    def swept(sweep):
-        visible = np.ones(heights.shape, bool)
+    def swept(make):
+        sweep, visible = make(), np.ones(heights.shape, bool)
         for strip in sweep.strips(512):
             visible[strip.slices] &= sweep(strip, heights[strip.slices])
 
@@ -251,12 +252,12 @@ def sight(bench):
         azimuth = np.deg2rad(azimuth_deg)
         return shadows.DirectionSweep((side, side), [np.sin(azimuth), np.cos(azimuth), 1.2], **cells)
 
-    cases = {f"cast shadow, sun at {azimuth} deg": lambda a=azimuth: swept(sun(a)) for azimuth in range(0, 360, 45)}
+    cases = {f"cast shadow, sun at {azimuth} deg": partial(sun, azimuth) for azimuth in range(0, 360, 45)}
     start, end = (middle, -2 * middle, height_m), (middle + 0.3 * middle, 0.0, height_m)
-    cases["occlusion of a line"] = lambda: swept(shadows.LineSweep((side, side), start, end, **cells))
-    camera = (middle, -middle, height_m)
-    cases["occlusion of a frame"] = lambda: swept(shadows.FrameSweep((side, side), camera, **cells))
-    times = bench.timed(normals=lambda: horn_normals(heights, **cells), **cases)
+    cases["occlusion of a line"] = partial(shadows.LineSweep, (side, side), start, end, **cells)
+    cases["occlusion of a frame"] = partial(shadows.FrameSweep, (side, side), (middle, -middle, height_m), **cells)
+    sweeps = {name: partial(swept, make) for name, make in cases.items()}
+    times = bench.timed(normals=partial(horn_normals, heights, **cells), **sweeps)
     for name in cases:
         yield ratio(f"{name} / normals", times[name], times["normals"], most=20 if "frame" in name else 5)
 
@@ -298,8 +299,9 @@ def main():
         only_interleave=options.interleave,
     ):
         lines.append(line)
-        print(table([line]).splitlines()[1], flush=True)
-    print("\n" + table(lines))
+        sys.stdout.write(table([line]).splitlines()[1] + "\n")
+        sys.stdout.flush()
+    sys.stdout.write("\n" + table(lines) + "\n")
     if options.json:
         options.json.write_text(as_json(lines), encoding="utf-8")
 

@@ -94,8 +94,21 @@ def make_city(folder, rows, cols, *, bands=4, codec="none", interleave="pixel", 
     return path
 
 
-def write_config(image, *, flat=False, shadows=False, products=("corrected", "flags"), quicklook=False, form="gtiff", **run):
-    """A configuration of the city beside its image; its path. `run` goes into [run], `form` is that of the files."""
+def write_config(
+    image,
+    *,
+    name="city",
+    flat=False,
+    shadows=False,
+    products=("corrected", "flags"),
+    quicklook=False,
+    form="gtiff",
+    **run,
+):
+    """A configuration of the city beside its image; its path.
+
+    name : of the configuration. form : of the files. run : keys of [run].
+    """
     with rasterio.open(image) as file:
         rows, cols = file.shape
     side_m = CELL_M * max(rows, cols)
@@ -120,6 +133,6 @@ def write_config(image, *, flat=False, shadows=False, products=("corrected", "fl
         "materials": {"classes": {str(value): name for value, name in MATERIALS.items()}},
         "scenes": [scene],
     }
-    path = Path(image).with_name("city.toml")
+    path = Path(image).with_name(f"{name}.toml")
     path.write_text(tomli_w.dumps(values), encoding="utf-8")
     return path

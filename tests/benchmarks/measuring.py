@@ -48,9 +48,9 @@ class Ratio:
 
 
 def interleaved(cases, rounds):
-    """Times of each of some functions, by name, called in turn; a first round warms up and does not count."""
+    """Times of each of some functions, by name, called in turn; before several rounds one warms up, uncounted."""
     walls, cpus = {name: [] for name in cases}, {name: [] for name in cases}
-    for number in range(rounds + 1):
+    for number in range(0 if rounds > 1 else 1, rounds + 1):
         for name, work in cases.items():
             gc.collect()
             before, start = resource.getrusage(resource.RUSAGE_SELF), time.perf_counter()
@@ -71,15 +71,18 @@ def ratio(name, over, under, **bar):
 
 
 def peak_mb(config):
-    """The most memory of a process of its own that runs a configuration. [MB]"""
+    """The most memory of a process of its own that runs a configuration. [MB]
+
+    As Linux tells it of that process alone; getrusage begins with what its parent had.
+    """
     code = (
-        "import resource, sys; from tscorr import batch\n"
+        "import re, sys; from pathlib import Path; from tscorr import batch\n"
         "outcome = batch.run(sys.argv[1], overwrite=True).scenes[0]\n"
         "assert outcome.state == 'done', outcome.error\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)"
+        "print(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1])"
     )
     result = subprocess.run([sys.executable, "-c", code, str(config)], capture_output=True, text=True, check=True)
-    return float(result.stdout)
+    return float(result.stdout) / 1e3
 
 
 def table(ratios):

@@ -7,7 +7,7 @@ from tscorr.rasters.envi_writing import ENVI_SUFFIX, EnviWriter
 from tscorr.rasters.header import IMAGE_TYPES, RasterInfo, can_hold, check_metric, check_overlap, describe, opened
 from tscorr.rasters.joining import join_rows, result
 from tscorr.rasters.kept import KeptReader
-from tscorr.rasters.reading import Reader, read_decimated, read_decimated_flags
+from tscorr.rasters.reading import Reader, read_decimated, read_decimated_flags, read_samples
 from tscorr.rasters.writing import Layer, Writer, make_cog
 
 __all__ = [
@@ -28,5 +28,6 @@ __all__ = [
     "opened",
     "read_decimated",
     "read_decimated_flags",
+    "read_samples",
     "result",
 ]

@@ -193,6 +193,29 @@ def _averages(pixels: PixelByPixel, shape: tuple[int, int], bands: Array, nodata
     return result
 
 
+def read_samples(info: RasterInfo, most: int, side: int) -> Array:
+    """Values of band 1 that are spread over a raster, float32 (pixels,), those that are not finite or nodata left out.
+
+    All of them where it is small; else of most x most windows of side x side pixels, each in one tile if that holds
+    it, so that few tiles are decoded.
+    """
+    axes = [
+        [(0, length)]
+        if length <= most * side
+        else [(_in_tile(round((length - side) * i / (most - 1)), side, tile), side) for i in range(most)]
+        for length, tile in zip(info.shape, info.tile, strict=True)
+    ]
+    with Reader(info, fill=float("nan")) as reader:
+        windows = [Block(row, col, height, width) for row, height in axes[0] for col, width in axes[1]]
+        values = np.concatenate([reader.read(window, 1).ravel() for window in windows])
+    return values[np.isfinite(values)]
+
+
+def _in_tile(first: int, side: int, tile: int) -> int:
+    """The first pixel of a run of `side`, moved back so that the run does not leave its tile."""
+    return min(first, max(first // tile * tile, (first // tile + 1) * tile - side)) if side <= tile else first
+
+
 def read_decimated_flags(info: RasterInfo, max_size: int) -> Array:
     """A flag layer on the pixels of `read_decimated`: (rows, cols), the nearest value."""
     rows, cols = info.shape

@@ -86,15 +86,25 @@ def target_of(scene: Scene) -> Path:
 def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
     """Correct a scene and publish its folder; the content of its report.json."""
     started = time.perf_counter()
-    with closing(scene), publish.Publication(target_of(scene)) as publication:
+    with (
+        closing(scene),
+        publish.EarlyHashes(scene.inputs) as hashes,
+        publish.Publication(target_of(scene)) as publication,
+    ):
         pipeline = Pipeline(scene, publication.folder)
         pipeline.run(progress)
-        return finish(scene, publication, pipeline.sums, time.perf_counter() - started)
+        return finish(scene, publication, hashes, pipeline.sums, time.perf_counter() - started)
 
 
-def finish(scene: Scene, publication: publish.Publication, sums: Sums, wall_s: float) -> dict[str, Any]:
-    """Write what stands beside the rasters of a scene, and publish; the content of its report.json."""
+def finish(
+    scene: Scene, publication: publish.Publication, hashes: publish.EarlyHashes, sums: Sums, wall_s: float
+) -> dict[str, Any]:
+    """Write what stands beside the rasters of a scene, and publish; the content of its report.json.
+
+    hashes : of the scene's inputs.
+    """
     folder = publication.folder
+    publication.hash_early(sorted(folder.iterdir()))
     facts = facts_of(scene, sums, wall_s)
     report = summary(facts)
     if "flags" in scene.config.output.products:
@@ -111,7 +121,7 @@ def finish(scene: Scene, publication: publish.Publication, sums: Sums, wall_s: f
     (folder / "report.html").write_text(page(report, facts, picture, widths), encoding="utf-8")
     write_json(stac_item(scene, folder, facts, report), folder / "item.json")
     (folder / "settings.toml").write_text(tomli_w.dumps(settings_of(scene)), encoding="utf-8")
-    hashes = {str(path): {"sha256": publish.sha256(path)} for path in scene.inputs}
+    inputs = hashes.entries()
     check_unchanged(scene)
     publication.commit(
         {
@@ -120,7 +130,7 @@ def finish(scene: Scene, publication: publish.Publication, sums: Sums, wall_s: f
             "key": resume_key(scene),
             "materials": list(scene.only),
             "products": products_of(scene),
-            "inputs": hashes,
+            "inputs": inputs,
         }
     )
     return report

@@ -22,6 +22,8 @@ Array = NDArray[Any]
 P = ParamSpec("P")
 T = TypeVar("T")
 
+HEIGHT_WINDOWS, HEIGHT_WINDOW_PX = 6, 256
+"""the coarse look at a large surface model: windows a side, and their side"""
 TALLY_PIXELS = 4e6
 """histograms are of every n-th row where an image has more pixels than this; counts are always of all"""
 
@@ -395,8 +397,7 @@ def _heights(settings: Any, files: tuple[rasters.RasterInfo, ...]) -> tuple[floa
     dsm = next((info for info in files if info.bands == 1), None)
     if dsm is None:
         return 0.0, 0.0
-    heights = rasters.read_decimated(dsm, 256)
-    heights = heights[np.isfinite(heights)]
+    heights = rasters.read_samples(dsm, HEIGHT_WINDOWS, HEIGHT_WINDOW_PX)
     if not heights.size:
         raise InputError(f"the surface model {dsm.path} holds no heights at all")
     return float(np.median(heights)), float(heights.max())

@@ -199,11 +199,15 @@ class Pipeline:
                 for writer in self.writers.values():
                     writer.abandon()
                 raise
-            with self.sums.timed("write"):
-                for name, writer in self.writers.items():
-                    writer.close()
-                    if scene.config.output.format == "cog":
-                        rasters.make_cog(writer.path, Resampling.nearest if name == "flags" else Resampling.average)
+            with self.sums.timed("write"), ThreadPoolExecutor(workers_of(scene)) as pool:
+                list(pool.map(self._close, self.writers.items()))
+
+    def _close(self, product: tuple[str, rasters.Writer]) -> None:
+        """Close and check one raster; make it what was asked for."""
+        name, writer = product
+        writer.close()
+        if self.scene.config.output.format == "cog":
+            rasters.make_cog(writer.path, Resampling.nearest if name == "flags" else Resampling.average)
 
     def block(self, block: Block) -> int:
         """Read, correct and write one block; the number of its pixels."""

@@ -125,7 +125,11 @@ def join(strips: Strips, wall_s: float) -> dict[str, Any]:
     """Publish the scene's folder out of its strips; the content of its report.json."""
     scene = strips.scene
     parts = [strips.part(number) for number in range(len(strips.blocks))]
-    with closing(scene), publish.Publication(target_of(scene)) as publication:
+    with (
+        closing(scene),
+        publish.EarlyHashes(scene.inputs) as hashes,
+        publish.Publication(target_of(scene)) as publication,
+    ):
         sums = Sums(len(scene.materials), scene.image.bands)
         for part in parts:
             add_sums(sums, json.loads((part / SUMS).read_text(encoding="utf-8")))
@@ -134,7 +138,7 @@ def join(strips: Strips, wall_s: float) -> dict[str, Any]:
             for part, file in zip(parts, files, strict=True):
                 _link(part / f"{product}.tif", file)
             rasters.join_rows(files, publication.folder / f"{product}.vrt")
-        report = finish(scene, publication, sums, wall_s)
+        report = finish(scene, publication, hashes, sums, wall_s)
     shutil.rmtree(strips.folder, ignore_errors=True)
     return report
 
