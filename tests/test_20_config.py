@@ -69,20 +69,20 @@ def test_an_unknown_key_of_a_table_names_the_nearest(tmp_path, change, wrong, pl
 @pytest.mark.parametrize(
     ("change", "wrong", "place", "meant"),
     [
-        ({"clas_map": "x"}, "clas_map", "scenes.0", "class_map"),
-        ({"sun": {"zenith_deg": 40.0, "azimuth_deg": 180.0, "tme": 1}}, "tme", "scenes.0.sun", "time"),
-        ({"view": {**SCENE["view"], "zenit_deg": 1.0}}, "zenit_deg", "scenes.0.view", "zenith_deg"),
+        ({"clas_map": "x"}, "clas_map", "scene 'roofs'", "class_map"),
+        ({"sun": {"zenith_deg": 40.0, "azimuth_deg": 180.0, "tme": 1}}, "tme", "scene 'roofs'.sun", "time"),
+        ({"view": {**SCENE["view"], "zenit_deg": 1.0}}, "zenit_deg", "scene 'roofs'.view", "zenith_deg"),
         (
             {"view": {"kind": "frame", "position": [0.0, 0.0, 1.0], "hight_offset_m": 1.0}},
             "hight_offset_m",
-            "scenes.0.view",
+            "scene 'roofs'.view",
             "height_offset_m",
         ),
-        ({"view": {"kind": "line", "trajectory": "t.csv", "csr": "EPSG:4326"}}, "csr", "scenes.0.view", "crs"),
-        ({"surface": {"kind": "flat", "height": 1.0}}, "height", "scenes.0.surface", "height_m"),
-        ({"surface": {"kind": "roof_planes", "path": "x", "pth": "y"}}, "pth", "scenes.0.surface", "path"),
-        ({"surface": {"kind": "normals", "path": "x", "height": "y"}}, "height", "scenes.0.surface", "heights"),
-        ({"truth": {"diffuse": "x", "sunlit": "y", "sunlight": "z"}}, "sunlight", "scenes.0.truth", "sunlit"),
+        ({"view": {"kind": "line", "trajectory": "t.csv", "csr": "EPSG:4326"}}, "csr", "scene 'roofs'.view", "crs"),
+        ({"surface": {"kind": "flat", "height": 1.0}}, "height", "scene 'roofs'.surface", "height_m"),
+        ({"surface": {"kind": "roof_planes", "path": "x", "pth": "y"}}, "pth", "scene 'roofs'.surface", "path"),
+        ({"surface": {"kind": "normals", "path": "x", "height": "y"}}, "height", "scene 'roofs'.surface", "heights"),
+        ({"truth": {"diffuse": "x", "sunlit": "y", "sunlight": "z"}}, "sunlight", "scene 'roofs'.truth", "sunlit"),
     ],
 )
 def test_an_unknown_key_of_a_scene_names_the_nearest(tmp_path, change, wrong, place, meant):
@@ -96,17 +96,22 @@ def test_a_key_that_is_like_nothing_known_gets_no_advice(tmp_path):
 @pytest.mark.parametrize(
     ("scene", "sections", "place", "value"),
     [
-        ({"saturation": "bright"}, {}, "scenes.0.saturation = 'bright'", "one a band"),
-        ({"scale": [1.0, "x"]}, {}, "scenes.0.scale = [1.0, 'x']", "one a band"),
-        ({"sun": {"zenith_deg": 95.0, "azimuth_deg": 0.0}}, {}, "scenes.0.sun.zenith_deg", "95.0"),
-        ({"sun": {"zenith_deg": float("nan"), "azimuth_deg": 0.0}}, {}, "scenes.0.sun.zenith_deg", "nan"),
-        ({"sun": {"time": "2026-06-21T10:12:00", "zenith_deg": 1.0}}, {}, "scenes.0.sun", "zone"),
-        ({"sun": {"zenith_deg": 40.0}}, {}, "scenes.0.sun", "azimuth_deg"),
-        ({"view": {"kind": "fram", "position": [0, 0, 1]}}, {}, "scenes.0.view.kind = 'fram'", "did you mean 'frame'"),
-        ({"view": {"zenith_deg": 1.0}}, {}, "scenes.0.view", "'kind'"),
-        ({"surface": {"kind": "dsms", "path": "x"}}, {}, "scenes.0.surface.kind = 'dsms'", "did you mean 'dsm'"),
-        ({"view": {"kind": "frame", "position": [0.0, 1.0]}}, {}, "scenes.0.view.position.2", "is missing"),
-        ({"quantity": "radiance"}, {}, "scenes.0.quantity", "'brdf'"),
+        ({"saturation": "bright"}, {}, "scene 'roofs'.saturation = 'bright'", "one a band"),
+        ({"scale": [1.0, "x"]}, {}, "scene 'roofs'.scale = [1.0, 'x']", "one a band"),
+        ({"sun": {"zenith_deg": 95.0, "azimuth_deg": 0.0}}, {}, "scene 'roofs'.sun.zenith_deg", "95.0"),
+        ({"sun": {"zenith_deg": float("nan"), "azimuth_deg": 0.0}}, {}, "scene 'roofs'.sun.zenith_deg", "nan"),
+        ({"sun": {"time": "2026-06-21T10:12:00", "zenith_deg": 1.0}}, {}, "scene 'roofs'.sun", "zone"),
+        ({"sun": {"zenith_deg": 40.0}}, {}, "scene 'roofs'.sun", "azimuth_deg"),
+        (
+            {"view": {"kind": "fram", "position": [0, 0, 1]}},
+            {},
+            "scene 'roofs'.view.kind = 'fram'",
+            "did you mean 'frame'",
+        ),
+        ({"view": {"zenith_deg": 1.0}}, {}, "scene 'roofs'.view", "'kind'"),
+        ({"surface": {"kind": "dsms", "path": "x"}}, {}, "scene 'roofs'.surface.kind = 'dsms'", "did you mean 'dsm'"),
+        ({"view": {"kind": "frame", "position": [0.0, 1.0]}}, {}, "scene 'roofs'.view.position.2", "is missing"),
+        ({"quantity": "radiance"}, {}, "scene 'roofs'.quantity", "'brdf'"),
         ({}, {"model": {"form": "half"}}, "model.form", "'simplified'"),
         ({}, {"run": {"workers": -1}}, "run.workers", "-1"),
         ({}, {"run": {"workers": 1.5}}, "run.workers", "1.5"),
@@ -123,9 +128,25 @@ def test_a_wrong_value_is_named_with_its_place(tmp_path, scene, sections, place,
     assert value in line
 
 
+@pytest.mark.parametrize(
+    ("names", "place"),
+    [
+        ({"name": "north"}, "scene 'north'.sun"),
+        ({"name": None, "image": "north.tif"}, "scene 'north.tif'.sun"),
+        ({"name": None, "image": None}, "scenes.0.sun"),
+        ({"name": 7}, "scenes.0.sun"),
+        ({"name": "a\nb"}, r"scene 'a\nb'.sun"),
+    ],
+)
+def test_a_scene_is_called_by_its_name_or_its_image(tmp_path, names, place):
+    with pytest.raises(ConfigError) as caught:
+        load_config(write_config(tmp_path, {"sun": {"zenith_deg": 40.0}, **names}))
+    assert f": {place} = " in str(caught.value)
+
+
 @pytest.mark.parametrize("key", ["image", "class_map", "view"])
 def test_a_missing_key_is_named(tmp_path, key):
-    assert problem_of(tmp_path, {key: None}).endswith(f"scenes.0.{key} is missing")
+    assert problem_of(tmp_path, {key: None}).endswith(f"scene 'roofs'.{key} is missing")
 
 
 def test_missing_tables_are_named(tmp_path):

@@ -127,6 +127,20 @@ def test_of_many_at_once_one_holds_the_folder_at_a_time(tmp_path):
     assert set(most) == {1}
 
 
+def test_a_file_that_its_holder_removes_meanwhile_is_made_anew(tmp_path, monkeypatch):
+    real, removed = lock._take, []
+
+    def late(descriptor, path):
+        if not removed:
+            removed.append(path)
+            path.unlink()
+        real(descriptor, path)
+
+    monkeypatch.setattr(lock, "_take", late)
+    with lock.locked(tmp_path):
+        assert json.loads((tmp_path / lock.LOCK).read_text())["pid"] == os.getpid()
+
+
 def test_a_lock_is_no_result(tmp_path):
     config = small_scene(tmp_path)
     result = batch.run(config)

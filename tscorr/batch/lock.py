@@ -15,7 +15,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,8 @@ def locked(folder: Path) -> Iterator[None]:
     finally:
         ended.set()
         renewal.join()
-        path.unlink(missing_ok=True)  # before the lock is let go: the next one then makes a file of its own
+        with suppress(OSError):  # the folder may have become read-only; a file that nobody locks holds nobody up
+            path.unlink()  # before the lock is let go: the next one then makes a file of its own
         os.close(descriptor)
 
 

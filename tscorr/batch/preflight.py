@@ -84,12 +84,12 @@ def _disk(todo: Sequence[Scene], folder: Path) -> Iterator[TscorrError]:
     least, most = (_peak(todo, which) for which in (0, 1))
     if least > free:
         yield OutputError(
-            f"the results need {least / 1e6:.0f} MB on the disk of {folder}, or {most / 1e6:.0f} MB where they do not "
-            f"compress; {free / 1e6:.0f} MB are free"
+            f"the results need {least / 1e6:.1f} MB on the disk of {folder}, or {most / 1e6:.1f} MB where they do not "
+            f"compress; {free / 1e6:.1f} MB are free"
         )
     elif most > free:
         log.warning(
-            "the results may need up to %.0f MB on the disk of %s; %.0f MB are free", most / 1e6, folder, free / 1e6
+            "the results may need up to %.1f MB on the disk of %s; %.1f MB are free", most / 1e6, folder, free / 1e6
         )
 
 

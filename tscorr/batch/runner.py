@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tscorr import config, publish
@@ -52,11 +52,18 @@ def run(
     return result
 
 
+class _LogFile(logging.FileHandler):
+    """A log file whose disk may be full: what cannot be written is left out, and not told on stderr line by line."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the library's name
+        """Do nothing."""
+
+
 @contextmanager
 def _log_file(folder: Path) -> Iterator[None]:
     """Everything that is logged goes to batch.log too, behind what earlier runs wrote; where it can be written."""
     try:
-        handler = logging.FileHandler(folder / "batch.log", encoding="utf-8")
+        handler = _LogFile(folder / "batch.log", encoding="utf-8")
     except OSError as error:
         log.warning("%s cannot be written: %s", folder / "batch.log", error.strerror)
         yield
@@ -70,4 +77,5 @@ def _log_file(folder: Path) -> Iterator[None]:
     finally:
         log.removeHandler(handler)
         log.setLevel(level)
-        handler.close()
+        with suppress(OSError):
+            handler.close()

@@ -27,7 +27,7 @@ def load_config(path: str | Path) -> Config:
     try:
         config = Config.model_validate(data)
     except ValidationError as error:
-        raise ConfigError("\n".join(_problem(path, item) for item in error.errors())) from None
+        raise ConfigError("\n".join(_problem(path, item, data) for item in error.errors())) from None
     folder = path.resolve().parent
     scenes = [scene for entry in config.scenes for scene in _expanded(entry, folder, path)]
     _require_distinct([scene.name or "" for scene in scenes], path)
@@ -57,7 +57,9 @@ def _expanded(scene: Scene, folder: Path, config: Path) -> Iterator[Scene]:
         try:
             yield Scene.model_validate({**filled, "image": str(image), "name": scene.name or image.stem})
         except ValidationError as error:
-            raise ConfigError("\n".join(_problem(config, item) for item in error.errors())) from None
+            scenes = {"scenes": [{"name": image.stem}]}
+            items = [{**item, "loc": ("scenes", 0, *item["loc"])} for item in error.errors()]
+            raise ConfigError("\n".join(_problem(config, item, scenes) for item in items)) from None
 
 
 def _matches(pattern: str, folder: Path, config: Path) -> list[Path]:
@@ -129,9 +131,11 @@ def _require_distinct(names: list[str], config: Path) -> None:
         known[folder] = name
 
 
-def _problem(path: Path, item: Mapping[str, Any]) -> str:
-    """One line for one problem that pydantic found."""
+def _problem(path: Path, item: Mapping[str, Any], data: Mapping[str, Any]) -> str:
+    """One line for one problem that pydantic found; scenes are called by their names in `data`, the file's content."""
     location = [part for i, part in enumerate(item["loc"]) if not _is_kind(item["loc"], i)]
+    if len(location) > 1 and location[0] == "scenes":
+        location[:2] = [_scene_label(data["scenes"][location[1]], location[1])]
     where = ".".join(str(part) for part in location) or "file"
     if item["type"] == "extra_forbidden":
         *place, key = location
@@ -148,6 +152,13 @@ def _problem(path: Path, item: Mapping[str, Any]) -> str:
     if where == "file":
         return f"{path}: {message}"
     return f"{path}: {where} = {item['input']!r}: {message[0].lower()}{message[1:]}"
+
+
+def _scene_label(scene: Any, number: int) -> str:
+    """What a scene is called in a message: by its name, else by its image, else by its number."""
+    given = scene if isinstance(scene, dict) else {}
+    name = given.get("name", given.get("image"))
+    return f"scene {name!r}" if isinstance(name, str) else f"scenes.{number}"
 
 
 def _is_kind(location: tuple[Any, ...], i: int) -> bool:

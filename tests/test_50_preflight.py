@@ -1,0 +1,231 @@
+"""preflight: what a batch needs is looked at before any pixel, and all that is missing is told at once."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from small_scene import (
+    BANDS,
+    SHAPE,
+    TILE,
+    small_scene,
+    write_config,
+    write_image,
+    write_inputs,
+    write_raster,
+)
+
+from tscorr import batch
+from tscorr.batch import preflight
+from tscorr.config import load_config
+from tscorr.errors import ConfigError, InputError, OutputError
+from tscorr.scene import forecast
+
+
+@pytest.fixture
+def no_pixels(monkeypatch):
+    """Fails where a scene is computed."""
+    monkeypatch.setattr(batch.local, "correct_scene", lambda *_: pytest.fail("work started"))
+
+
+def problems(config, error=InputError, **options):
+    """The lines of what `run` says before it starts."""
+    with pytest.raises(error) as caught:
+        batch.run(config, **options)
+    assert type(caught.value) is error
+    return str(caught.value).splitlines()
+
+
+@pytest.mark.usefixtures("no_pixels")
+def test_everything_that_is_wrong_is_told_at_once(tmp_path):
+    write_inputs(tmp_path)
+    write_raster(tmp_path / "percent.tif", np.full(SHAPE, 80, np.uint8))
+    write_raster(tmp_path / "one_band.tif", np.ones(SHAPE, np.float32))
+    (tmp_path / "file").write_text("x")
+    config = write_config(
+        tmp_path,
+        {"name": "a", "image": "nix.tif"},
+        {"name": "b", "class_map": "no_classes.tif", "class_confidence": "percent.tif", "sun": None},
+        {"name": "c", "truth": {"diffuse": "one_band.tif", "sunlit": "one_band.tif"}, "scale": [1.0, 2.0]},
+        {"name": "d"},
+        output={"directory": "file/out"},
+        materials={"classes": {"1": "roof_tyle", "2": "lambertian"}},
+    )
+    told = problems(config)
+    wanted = [
+        "no material 'roof_tyle' (did you mean 'roof_tile'?)",
+        f"scene 'a': {tmp_path}/nix.tif does not exist",
+        f"scene 'b': {tmp_path}/no_classes.tif does not exist",
+        f"scene 'b': the class confidence {tmp_path}/percent.tif holds values from 80 to 80; allowed are 0 to 1",
+        f"scene 'c': the truth {tmp_path}/one_band.tif has 1 bands of {SHAPE}; allowed are {BANDS} of {SHAPE}",
+        "scene 'c': scale has 2 values; the image",
+        f"[output] directory = {tmp_path}/file/out: {tmp_path}/file is not a folder",
+    ]
+    assert [line[: len(start)] for line, start in zip(told, wanted, strict=True)] == wanted
+
+
+def test_a_stored_scale_makes_a_confidence_in_per_cent_right(tmp_path):
+    write_inputs(tmp_path)
+    write_raster(tmp_path / "percent.tif", np.full(SHAPE, 80, np.uint8))
+    import rasterio
+
+    with rasterio.open(tmp_path / "percent.tif", "r+") as file:
+        file.scales = (0.01,)
+    assert batch.plan(load_config(write_config(tmp_path, {"class_confidence": "percent.tif"})))
+
+
+@pytest.mark.usefixtures("no_pixels")
+def test_a_disk_that_is_too_small_is_told_with_the_estimate(tmp_path, monkeypatch, caplog):
+    config = small_scene(tmp_path, {"name": "a"}, {"name": "b"})
+    stored = min((tmp_path / "image.tif").stat().st_size, SHAPE[0] * SHAPE[1] * BANDS * 2)
+    raw = SHAPE[0] * SHAPE[1] * (BANDS * 2 + 2 + BANDS * 2)  # corrected and removed, flags
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(preflight.shutil, "disk_usage", lambda _: usage._replace(free=2 * stored - 1))
+    (line,) = problems(config, OutputError)
+    assert f"the results need {2 * stored / 1e6:.1f} MB on the disk of {tmp_path}" in line
+    monkeypatch.setattr(preflight.shutil, "disk_usage", lambda _: usage._replace(free=2 * raw - 1))
+    batch.plan(load_config(config), to_run=True)
+    assert "the results may need up to" in caplog.text
+    caplog.clear()
+    monkeypatch.setattr(preflight.shutil, "disk_usage", lambda _: usage._replace(free=2 * raw))
+    batch.plan(load_config(config), to_run=True)
+    assert caplog.text == ""
+
+
+def test_what_is_done_and_what_is_replaced_needs_no_disk(tmp_path, monkeypatch):
+    config = small_scene(tmp_path, {"name": "a"}, {"name": "b"})
+    batch.run(config)
+    usage = shutil.disk_usage(tmp_path)
+    stored = (tmp_path / "image.tif").stat().st_size
+    monkeypatch.setattr(preflight.shutil, "disk_usage", lambda _: usage._replace(free=0))
+    assert batch.run(config).exit_code == 0  # all is current
+    monkeypatch.setattr(preflight.shutil, "disk_usage", lambda _: usage._replace(free=stored))
+    assert batch.run(config, overwrite=True).exit_code == 0  # one new result beside the old ones at a time
+
+
+def test_an_estimate_of_the_disk_bounds_what_is_written(tmp_path):
+    every = ["corrected", "flags", "removed", "azimuthal_width", "angles"]
+    for kind in ("gtiff", "cog"):
+        folder = tmp_path / kind
+        folder.mkdir()
+        output = {"directory": "out", "quicklook": False, "products": every, "format": kind, "compression": "none"}
+        write_image(folder / "image.tif", np.full((BANDS, 512, 512), 4000, np.int16))
+        write_raster(folder / "class_map.tif", np.full((512, 512), TILE, np.uint8))
+        config = write_config(folder, {"surface": None}, output=output)
+        (scene,) = batch.plan(load_config(config))
+        least, most = forecast.disk_bytes(scene)
+        batch.run(config)
+        written = sum(path.stat().st_size for path in (folder / "out/roofs").glob("*.tif"))
+        tables = 16e3 * len(every)  # headers and tags, which a real image makes forgotten
+        assert least <= written <= most + tables
+
+
+@pytest.mark.usefixtures("no_pixels")
+def test_an_image_whose_blocks_do_not_fit_into_the_limit_is_told(tmp_path):
+    write_image(tmp_path / "image.tif", np.full((3, 2048, 2048), 4000, np.int16), blockxsize=2048, blockysize=2048)
+    write_raster(tmp_path / "class_map.tif", np.full((64, 64), TILE, np.uint8), cell=16.0)
+    config = write_config(tmp_path, {"surface": None}, run={"memory_limit_mb": 400})
+    (line,) = problems(config, ConfigError)
+    said = f"scene 'roofs' takes about 597 MB of memory, since the image {tmp_path}/image.tif is stored in blocks of"
+    assert line.startswith(f"{said} 2048 x 2048 pixels; [run] memory_limit_mb = 400: allow more")
+    allowed = write_config(tmp_path, {"surface": None}, run={"memory_limit_mb": 600})
+    assert batch.plan(load_config(allowed), to_run=True)
+
+
+@pytest.mark.usefixtures("no_pixels")
+def test_a_machine_without_memory_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(preflight, "available_mb", lambda: 100.0)
+    (line,) = problems(small_scene(tmp_path), OutputError)
+    assert line.startswith("scene 'roofs' takes at least 2")
+    assert line.endswith("MB of memory; 100 MB are available")
+
+
+def test_the_machine_says_how_much_memory_it_has():
+    assert 10 < forecast.available_mb() < 1e9
+
+
+def read_only(folder):
+    """Make a folder that nobody can write to, root neither; skip where that cannot be."""
+    if os.geteuid() != 0:
+        folder.chmod(0o555)
+        return lambda: folder.chmod(0o755)
+    if shutil.which("chattr") is None or subprocess.run(["chattr", "+i", folder], check=False).returncode:
+        pytest.skip("as root a folder is only read-only where chattr works")
+    return lambda: subprocess.run(["chattr", "-i", folder], check=True)
+
+
+@pytest.mark.usefixtures("no_pixels")
+def test_a_folder_that_cannot_be_written_is_told_even_to_root(tmp_path):
+    config = small_scene(tmp_path)
+    (tmp_path / "out").mkdir()
+    undo = read_only(tmp_path / "out")
+    try:
+        (line,) = problems(config, ConfigError)
+    finally:
+        undo()
+    assert line.startswith(f"[output] directory = {tmp_path}/out: {tmp_path}/out cannot be written: ")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_folder_that_becomes_read_only_fails_the_scene_and_the_next_run_makes_good(tmp_path):
+    config = small_scene(tmp_path)
+    undo = []
+    result = batch.run(config, progress=lambda _: lambda _: undo.append(read_only(tmp_path / "out")))
+    undo[0]()
+    assert result.exit_code == 3
+    assert "roofs cannot be published" in result.scenes[0].error
+    assert not (tmp_path / "out" / "roofs").exists()
+    assert batch.run(config).exit_code == 0
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.name.startswith(".")] == []
+
+
+LIMITED = """
+import resource, sys
+from tscorr.cli import cli
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
+cli(["run", "-q", sys.argv[2]])
+"""
+
+
+def on_a_file_size_limit(config, _):
+    """A run that can write no file of more than 300 kB."""
+    return subprocess.run(
+        [sys.executable, "-c", LIMITED, "300000", config], capture_output=True, text=True, check=False
+    )
+
+
+def on_a_small_disk(config, folder):
+    """A run on a file system of 600 kB."""
+    folder.mkdir(exist_ok=True)
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=600k", "tscorr", folder], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip("a file system can only be mounted by root")
+    try:
+        command = [sys.executable, "-m", "tscorr", "run", "-q", config]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert [path.name for path in folder.iterdir() if path.name.startswith(".") or path.is_dir()] == []
+        return result
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+@pytest.mark.parametrize("full", [on_a_file_size_limit, on_a_small_disk])
+def test_a_disk_that_fills_up_fails_the_scene_and_leaves_nothing(tmp_path, full):
+    noise = np.random.default_rng(3).integers(3000, 6000, (3, 256, 256)).astype(np.int16)
+    write_image(tmp_path / "image.tif", noise)
+    write_raster(tmp_path / "class_map.tif", np.full((256, 256), TILE, np.uint8))
+    config = write_config(tmp_path, {"surface": None}, output={"directory": "out", "compression": "deflate"})
+    result = full(config, tmp_path / "out")
+    assert result.returncode == 3
+    told = [line for line in result.stderr.splitlines() if not line.startswith("libpng")]  # it speaks for itself
+    assert [line for line in told if not line.startswith("tscorr: ")] == []
+    (failed,) = (line for line in told if line.startswith("tscorr: scene 'roofs' failed: "))
+    assert "No space left" in failed or "File too large" in failed
+    assert not (tmp_path / "out" / "roofs").exists()
+    assert batch.run(config).exit_code == 0
