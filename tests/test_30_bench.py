@@ -2,6 +2,8 @@
 
 import copy
 import json
+import runpy
+from pathlib import Path
 
 import mpmath as mp
 import numpy as np
@@ -265,3 +267,16 @@ def test_fast_keeps_its_promise_for_lobes_of_any_width(limit, w, n, k, monkeypat
 
     _, heights = climb(excess, start, excess(start), rng, max_zenith_deg=limit, rounds=8)
     assert 0.01 < heights.max() <= 1
+
+
+# The script that times the kernel
+
+
+def test_the_kernel_is_timed_by_a_script(tmp_path, capsys):
+    """It runs, and its JSON holds what it prints; a small block on a busy machine judges nothing."""
+    script = runpy.run_path(str(Path(__file__).parent / "benchmarks" / "kernel.py"))
+    script["main"](["--quick", "--json", str(tmp_path / "kernel.json")])
+    found = json.loads((tmp_path / "kernel.json").read_text())
+    assert found["ns_per_pixel"]["numpy"] > found["ns_per_pixel"]["kernel"] > found["ns_per_pixel"]["memcpy"] > 0
+    printed = {line.split()[0]: float(line.split()[1]) for line in capsys.readouterr().out.splitlines()}
+    assert printed == pytest.approx({**found["ns_per_pixel"], **found["ratios"]}, rel=1e-6, abs=0.051)

@@ -1,10 +1,12 @@
 """The fast arithmetic: twins of `reference.py`, and the one loop that a run spends its time in.
 
 The small functions take scalars and unit vectors as tuples of three, and are float64 where their arguments
-are. `correct_block` works on chunks of a row, class by class, in place. Its rules: unit-stride loops over
-scratch arrays so that LLVM vectorises them, indexed loads in loops of their own, constants of the width of
-the data, no fastmath (so nan keeps its meaning and every instruction set gives the same bits), polynomials
-instead of library calls.
+are. `correct_block` works on chunks of a row, all materials at once, in place, as a list of steps: each a small
+function with one loop. Their rules: unit-stride loops over the chunk's scratch memory, which LLVM vectorises since
+it sees that lines of one array do not overlap; no index whose sign LLVM cannot tell (`line[start + j]`: pass a slice
+instead); constants of the width of the data; no fastmath, so nan keeps its meaning and every instruction set gives
+the same bits; polynomials instead of library calls. A step allocates nothing and is called from compiled code only,
+which spares half of its compilation.
 
 Constants are np.float32 so that float32 arithmetic stays float32; all but the polynomials' are exact.
 Compiled once for tables of float32 (`precision = "fast"`) and once for float64 ("exact"). Directions are float64 in
@@ -21,6 +23,7 @@ from numba import njit
 CHUNK = 128
 """pixels of a row that are worked on at a time: their scratch arrays stay in the L1 cache"""
 
+ENDLESS = np.float32(math.inf)
 ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 DEG_PER_RAD = 180 / math.pi
 
@@ -34,10 +37,17 @@ HIDDEN = np.uint16(8 | 16)
 QUALITY = np.uint16(2048 | 4096)
 ON_ENTRY = np.uint16(8 | 16 | 2048 | 4096)
 
-# What to do with an uncorrectable pixel.
-BEST, KEEP, BLANK = 0, 1, 2
+# SPECULAR_STATE, in bits 6 and 7.
+NEGLIGIBLE_STATE, CORRECTED_STATE, UNCORRECTABLE_STATE, REFUSED_STATE = 0, 1, 2, 3
+STATE_SHIFT = 6
+
+# How a material is corrected: without G; R refers to the horizontal plane, not to the facet; an uncorrectable pixel
+# keeps its value, or becomes nodata.
+SIMPLIFIED, LEVEL, KEEP, BLANK = 1, 2, 4, 8
 
 FRESNEL_DEGREE = 12
+NO_KIND = np.int32(256)
+"""beyond every row of a table"""
 
 # alpha^2 / u over u = 1 - cos alpha in [0, 1]; largest relative error 7e-9
 A0, A1, A2 = np.float32(2.0), np.float32(0.33333173), np.float32(0.08893097)
@@ -52,7 +62,26 @@ MOST_STEPS = np.float32(2**30)
 """more stored steps than any image has, and fewer than overflow an int32"""
 BOUND_MARGIN = np.float32(0.999)
 """a chunk is skipped where its bound is below this part of the threshold: room for rounding"""
-LOWEST_EXPONENT = np.float32(-126)  # of a normal float32; below, exp is 0
+LOWEST_EXPONENT = np.float32(-100)
+"""2 to the power of less is taken for 0, so that no product gets denormal, which costs 100 times as much"""
+
+DEGREES_PER_RAD, QUARTERS_PER_RAD, TEN = np.float32(180 / math.pi), np.float32(720 / math.pi), np.float32(10)
+LAST_QUARTER, LAST_TENTH = np.float32(359), np.float32(899)
+"""the last bins of the histograms"""
+
+# Lines of `Scratch.aims`, `real` and `whole`.
+SUN, VIEW, NORMAL = 0, 3 * CHUNK, 6 * CHUNK
+(
+    COS_I, COS_R, COS_L, ALPHA2, SUN_UP, COS_MIN, COS_MAX, NEGLIGIBLE, LIMIT, BOUND, SHAPE, W2, EXPONENTIAL, LOBE,
+    SHARE, THRESHOLD, TILT,
+) = range(0, 17 * CHUNK, CHUNK)  # fmt: skip
+(
+    KIND, MISSING, SATURATES, ASSESS, HIT, OVER, CLIPS, MARKS, STATE, WAYS, TAKE, POWER, INCIDENCE_BIN, TILT_BIN,
+) = range(0, 14 * CHUNK, CHUNK)  # fmt: skip
+
+BLOCK: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+STEP: dict[str, Any] = {**BLOCK, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""how `correct_block` and its steps are compiled: without reference counts, since nothing is allocated"""
 
 
 class MaterialTable(NamedTuple):
@@ -69,19 +98,14 @@ class MaterialTable(NamedTuple):
     n: Any
     k: Any
     """float64 (m, bands): refractive index n - ik"""
-    fresnel: Any
-    """(m, bands, FRESNEL_DEGREE + 3): polynomial of F in x = cos_l * scale + shift, lowest power first, then scale and
-    shift; scale is 0 where the polynomial misses its bound and `fresnel` is to be taken"""
     shared: Any
     """bool (m, bands): w, n and k are those of the band before"""
     bound: Any
     """(m,): no band's pi beta t1 F is larger"""
     one_w: Any
     """bool (m,): all bands have the same w"""
-    simplified: Any
-    """bool (m,): without G"""
-    horizontal: Any
-    """bool (m,): R refers to the horizontal plane, not to the facet"""
+    ways: Any
+    """int64 (m,): SIMPLIFIED | LEVEL | KEEP | BLANK"""
     cos_min: Any
     cos_max: Any
     """(m,): cosines of incidence and exitance that are not grazing"""
@@ -89,8 +113,6 @@ class MaterialTable(NamedTuple):
     """(m,): reflectance factor below which nothing is removed"""
     share: Any
     """(m,): share of the signal above which a pixel is uncorrectable"""
-    policy: Any
-    """int64 (m,): BEST, KEEP or BLANK"""
 
 
 class PixelRules(NamedTuple):
@@ -110,7 +132,29 @@ class PixelRules(NamedTuple):
     has_nodata: bool
     dodge: bool
     """a corrected value must step aside where it would read as nodata"""
-    integer: bool
+    integer: Any
+    """True, or None where the image is of floating point"""
+
+
+class Scratch(NamedTuple):
+    """Memory of one thread, a line of CHUNK values for each quantity of a chunk: see `new_scratch`.
+
+    One flat array holds the lines of a type, at the places that are named below: so LLVM knows that they do not
+    overlap, which separate arrays would have to prove at run time, loop by loop.
+    """
+
+    aims: Any
+    """float64: three vectors"""
+    real: Any
+    """float32 or float64"""
+    whole: Any
+    """int32"""
+    power: Any
+    """whole[POWER:] read as float32"""
+    amounts: Any
+    """(bands, CHUNK): reflectance factor to remove"""
+    present: Any
+    """(256,): materials of a chunk"""
 
 
 class Tally(NamedTuple):
@@ -191,8 +235,23 @@ def specular(geometry, w, n, k, simplified):
     return fresnel(cos_l, n, k) / (cos_i * cos_r) * g * facet_distribution(alpha, w)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def correct_block(image, removed, flags, material, sun, view, normal, table, rules, tally, options):
+def new_scratch(bands: int, real: type[np.floating[Any]]) -> Scratch:
+    """Memory for one thread."""
+    whole = np.zeros(14 * CHUNK, np.int32)
+    return Scratch(
+        aims=np.zeros(9 * CHUNK),
+        real=np.zeros(17 * CHUNK, real),
+        whole=whole,
+        power=whole[POWER : POWER + CHUNK].view(np.float32),
+        amounts=np.zeros((bands, CHUNK), real),
+        present=np.zeros(256, np.int64),
+    )
+
+
+@njit(**BLOCK)
+def correct_block(
+    image, removed, flags, material, sun, view, normal, table, polynomials, rules, tally, scratch, options
+):
     """Take the specular part out of a block of an image, in place. Twin of reference.correct_block.
 
     image    : (bands, rows, cols), stored values; changed in place.
@@ -202,494 +261,499 @@ def correct_block(image, removed, flags, material, sun, view, normal, table, rul
                has a peak, since there nobody looked.
     material : uint8 (rows, cols), rows of `table`; 0 is no material.
     sun, view, normal : unit vectors, float64 (3, rows, cols), or (3, 1, 1) where constant.
-    options  : int64 (4,): exact, skip, first row of the block in the image, tally every so many rows.
+    polynomials : (materials, bands, FRESNEL_DEGREE + 3), F in x = cos_l * scale + shift: lowest power first, then
+               scale and shift; scale is 0 where the polynomial misses its bound and `fresnel` is to be taken.
+               Or None: the equations themselves at each pixel, in float64.
+    options  : int64 (3,): skip, first row of the block in the image, tally every so many rows.
     """
     bands, rows, cols = image.shape
-    exact, skip, first_row, stride = options[0] != 0, options[1] != 0, options[2], options[3]
-    want_removed = removed.shape[1] == rows
-    real = table.gain.dtype
-    peak, states = table.peak, tally.states  # taken out of their tuples once: each access costs a reference count
-    cos_min_of, cos_max_of, negligible_of, limit_of = table.cos_min, table.cos_max, table.negligible, table.share
-    bound_of, simplified_of, horizontal_of = table.bound, table.simplified, table.horizontal
-    policy_of, w2_of, gain_of, shared_of, one_w = table.policy, table.w2, table.gain, table.shared, table.one_w
-    fresnel_of, n_of, k_of = table.fresnel, table.n, table.k
-    scale, offset, steps, lowest = rules.scale, rules.offset, rules.steps, rules.lowest
-    saturation, nodata = rules.saturation, rules.nodata
-    has_nodata, dodges, integer = rules.has_nodata, rules.dodge, rules.integer
-
-    present = np.zeros(peak.size, np.bool_)
-    fixed = np.zeros((9, CHUNK), np.float64)
-    kind, missing, saturated = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
-    assess, hit, state = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
-    clipped, policy = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
-    simplified, horizontal = np.zeros(CHUNK, np.int32), np.zeros(CHUNK, np.int32)
-    power_bits = np.zeros(CHUNK, np.int32)
-    power = power_bits.view(np.float32)
-    cos_i, cos_r, cos_l = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    cos_min, cos_max, alpha2 = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    negligible, limit, bound = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    shape, w2, exponential = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    lobe, share, new_values = np.zeros(CHUNK, real), np.zeros(CHUNK, real), np.zeros(CHUNK, real)
-    sun_up = np.zeros(CHUNK, real)
-    amount = np.zeros((bands, CHUNK), real)
-    if rows * cols > 0:
-        _set_constants(fixed, sun, view, normal)
-
+    skip, first_row, stride = options[0] != 0, options[1], options[2]
+    aims, real, whole, amounts, present = scratch.aims, scratch.real, scratch.whole, scratch.amounts, scratch.present
+    nodata = rules.nodata[0]
     for row in range(rows):
         tallied = (first_row + row) % stride == 0
         for start in range(0, cols, CHUNK):
             stop = min(start + CHUNK, cols)
-            count = stop - start
-            marks = flags[row, start:stop]
+            count, marks = stop - start, flags[row, start:stop]
 
-            # Which materials, and which pixels have data.
-            _clear(missing)
-            _clear(saturated)
+            # Which materials there are, and whether the geometry lets them be assessed.
+            _load(material[row, start:stop], marks, whole)
             for b in range(bands):
-                _look(missing, saturated, image[b, row, start:stop], saturation[b], has_nodata, nodata[0])
-            _list(kind, present, material[row, start:stop])
-            any_peak = False
-            for q in range(present.size):
-                if present[q]:
-                    _mark(marks, kind, missing, saturated, np.int32(q), peak[q], states)
-                    present[q] = peak[q]
-                    any_peak |= peak[q]
-            if not any_peak:
-                continue
+                _look(image[b, row, start:stop], rules.saturation[b], rules.has_nodata, nodata, whole)
+            kinds, peaks = _list_kinds(whole, count, table.peak, present)
+            for place in range(peaks):
+                _set_rules(whole, real, table, present[place])
+            _mark_known(whole)
+            assessed, hits = 0, 0
+            if peaks > 0:
+                _aim(sun, SUN, row, start, stop, aims)
+                _aim(view, VIEW, row, start, stop, aims)
+                _aim(normal, NORMAL, row, start, stop, aims)
+                _set_cosines(aims, real)
+                assessed = _assess(whole, real)
 
-            # Everything about the geometry but the surface's material.
-            sx, sy, sz = (
-                _line(sun, fixed, 0, row, start, stop),
-                _line(sun, fixed, 1, row, start, stop),
-                _line(sun, fixed, 2, row, start, stop),
-            )
-            vx, vy, vz = (
-                _line(view, fixed, 3, row, start, stop),
-                _line(view, fixed, 4, row, start, stop),
-                _line(view, fixed, 5, row, start, stop),
-            )
-            nx, ny, nz = (
-                _line(normal, fixed, 6, row, start, stop),
-                _line(normal, fixed, 7, row, start, stop),
-                _line(normal, fixed, 8, row, start, stop),
-            )
-            _cosines(cos_i, cos_r, cos_l, alpha2, sun_up, sx, sy, sz, vx, vy, vz, nx, ny, nz)
-
-            # The rules of each pixel's material, and whether it can be assessed.
-            _clear(assess)
-            for q in range(1, present.size):
-                if present[q]:
-                    q32 = np.int32(q)
-                    _set(cos_min, kind, q32, cos_min_of[q])
-                    _set(cos_max, kind, q32, cos_max_of[q])
-                    _set(negligible, kind, q32, negligible_of[q])
-                    _set(limit, kind, q32, limit_of[q])
-                    _set(bound, kind, q32, bound_of[q])
-                    _set(simplified, kind, q32, np.int32(simplified_of[q]))
-                    _set(horizontal, kind, q32, np.int32(horizontal_of[q]))
-                    _set(policy, kind, q32, np.int32(policy_of[q]))
-                    _want(assess, kind, missing, q32, count)
-            assessed = _assess(assess, cos_min, cos_max, cos_i, cos_r, marks)
+            # What is to be removed, and what becomes of each pixel.
             inside = assessed > 0
             if inside:
-                tally.attenuated[0] += _set_shape(
-                    assess, simplified, horizontal, cos_i, cos_r, cos_l, shape, sun_up, count
-                )
-
-            # The reflectance to remove in each band; bands with the same w, n, k share the lobe. A chunk is out of
-            # the lobe if the largest pi beta t1 F times the exponential stays below the threshold everywhere.
-            may_skip = skip
-            for q in range(1, present.size):
-                may_skip &= not present[q] or one_w[q]
-            for b in range(bands if inside else 0):
-                again = b == 0
-                for q in range(1, present.size):
-                    again |= present[q] and not shared_of[q, b]
-                if again and exact:
-                    for j in range(count):
-                        lobe[j] = ZERO
-                        if assess[j] != 0:
-                            q = kind[j]
-                            angles = geometry((sx[j], sy[j], sz[j]), (vx[j], vy[j], vz[j]), (nx[j], ny[j], nz[j]))
-                            f = specular(angles, table.w[q, b], n_of[q, b], k_of[q, b], simplified[j] != 0)
-                            lobe[j] = f * angles[0] / sz[j] if horizontal[j] != 0 else f
-                elif again:
-                    for q in range(1, present.size):
-                        if present[q]:
-                            _set(w2, kind, np.int32(q), w2_of[q, b])
-                    _set_exponential(exponential, power_bits, power, w2, alpha2, shape)
-                    if may_skip and b == 0 and _is_outside(negligible, bound, exponential, count):
-                        inside = False
-                        tally.out_of_lobe[0] += assessed
-                        break
-                    for q in range(1, present.size):
-                        if present[q]:
-                            _set_lobe(
-                                lobe, kind, cos_l, exponential, np.int32(q), fresnel_of[q, b], n_of[q, b], k_of[q, b]
-                            )
-                for q in range(1, present.size):
-                    if present[q]:
-                        _set_amount(amount[b], lobe, kind, np.int32(q), gain_of[q, b])
-
-            # What becomes of each pixel.
-            _clear(hit)
-            _clear(state)
-            share[:] = ZERO
+                tally.attenuated[0] += _set_shape(whole, real)
+                inside = _set_amounts(scratch, table, polynomials, peaks, skip)
+                tally.out_of_lobe[0] += 0 if inside else assessed
             if inside:
+                _clear(whole, real)
                 for b in range(bands):
-                    line = image[b, row, start:stop]
-                    _weigh(amount[b], line, scale[b], offset[b], assess, negligible, limit, hit, state, share)
-            hits = _settle(hit, state, saturated, count)
-            for q in range(1, present.size):
-                if present[q]:
-                    _count_states(kind, missing, assess, state, np.int32(q), count, states)
-            if hits > 0:
-                _clear(clipped)
+                    _weigh(amounts[b], image[b, row, start:stop], rules.scale[b], rules.offset[b], whole, real)
+                hits = _settle(whole)
+            for b in range(bands if hits > 0 else 0):
+                line = image[b, row, start:stop]
+                if tallied:
+                    _set_share(amounts[b], line, rules.scale[b], rules.offset[b], real)
+                _subtract(amounts[b], line, rules, b, whole, real)
+                if removed.shape[1] > 0:
+                    _keep(amounts[b], removed[b, row, start:stop], whole)
+            if hits > 0 and _count_blanks(whole) > 0:
                 for b in range(bands):
-                    line = image[b, row, start:stop]
-                    _subtract(
-                        amount[b],
-                        line,
-                        new_values,
-                        state,
-                        policy,
-                        clipped,
-                        steps[b],
-                        lowest[b],
-                        saturation[b],
-                        nodata[0],
-                        dodges,
-                        integer,
-                    )
-                    if want_removed:
-                        _keep(amount[b], removed[b, row, start:stop], hit)
-                blanks = _mark_states(marks, state, clipped, policy)
-                if blanks > 0:
-                    for b in range(bands):
-                        _blank(image[b, row, start:stop], state, policy, nodata[0])
+                    _blank(image[b, row, start:stop], nodata, whole)
+
+            _store(marks, whole)
+            for place in range(kinds):
+                _count_states(whole, np.int32(present[place]), count, tally.states)
             if tallied and assessed > 0:
-                _tally_geometry(kind, assess, cos_i, alpha2, count, tally)
-                if hits > 0:
-                    _tally_removed(kind, hit, simplified, cos_i, cos_r, cos_l, share, amount, count, rules, tally)
+                _tally_geometry(whole, real, count, tally)
+            if tallied and hits > 0:
+                _tally_removed(whole, real, amounts, count, rules.scale, tally)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _clear(values):
-    """Zeros."""
+@njit(**STEP)
+def _load(kinds, marks, whole):
+    """Materials and flags of a chunk; no material beyond its end."""
     for j in range(CHUNK):
-        values[j] = 0
+        whole[KIND + j] = 0
+        whole[MISSING + j] = 0
+        whole[SATURATES + j] = 0
+        whole[ASSESS + j] = 0
+        whole[CLIPS + j] = 0
+    for j in range(kinds.size):
+        whole[KIND + j] = kinds[j]
+    for j in range(marks.size):
+        whole[MARKS + j] = marks[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _set_constants(fixed, sun, view, normal):
-    """The first vector of each field along whole lines: what `_line` gives for a field of one pixel."""
-    for c in range(3):
-        fixed[c, :], fixed[c + 3, :], fixed[c + 6, :] = sun[c, 0, 0], view[c, 0, 0], normal[c, 0, 0]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _line(field, fixed, place, row, start, stop):
-    """A piece of a row of one component of a vector field, constant where the field is one pixel."""
-    return fixed[place, : stop - start] if field[0].size == 1 else field[place % 3, row, start:stop]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _look(missing, saturated, line, saturation, has_nodata, nodata):
+@njit(**STEP)
+def _look(line, saturation, has_nodata, nodata, whole):
     """Which pixels have no data in a band, and which are saturated in it."""
     for j in range(line.size):
         value = np.float32(line[j])
-        missing[j] |= np.int32(value - value != ZERO)
-        saturated[j] |= np.int32(value >= saturation)
+        whole[MISSING + j] |= np.int32(value - value != ZERO)
+        whole[SATURATES + j] |= np.int32(value >= saturation)
     if has_nodata:
         for j in range(line.size):
-            missing[j] |= np.int32(line[j] == nodata)
+            whole[MISSING + j] |= np.int32(line[j] == nodata)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _list(kind, present, line):
-    """The material of each pixel, as wide as the other arrays, and which materials there are."""
-    present[:] = False
-    for j in range(line.size):
-        present[line[j]] = True
-    for j in range(line.size):
-        kind[j] = line[j]
+@njit(**STEP)
+def _list_kinds(whole, count, peak, present):
+    """List the materials of a chunk in `present`, those with a peak first; how many, and how many have one."""
+    kinds, peaks, last = 0, 0, np.int32(-1)
+    while True:
+        least = NO_KIND
+        for j in range(count):
+            q = whole[KIND + j] if whole[KIND + j] > last else NO_KIND
+            least = q if q < least else least
+        if least == NO_KIND:
+            return kinds, peaks
+        last = least
+        present[kinds] = last
+        kinds += 1
+        if peak[last]:
+            present[kinds - 1], present[peaks] = present[peaks], last
+            peaks += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _mark(marks, kind, missing, saturated, q32, peak, states):
-    """The flags of one material's pixels that need no geometry; counts those that are done with."""
-    known = ON_ENTRY if peak else QUALITY
-    none = NO_MATERIAL | NOT_ASSESSED if q32 == 0 else NO_FLAG
-    pixels, gaps = 0, 0
-    for j in range(marks.size):
-        mine, gap = kind[j] == q32, missing[j] != 0
-        f = (marks[j] & known) | none | (SATURATED if saturated[j] != 0 else NO_FLAG)
-        f = (marks[j] & QUALITY) | NODATA | NOT_ASSESSED if gap else f
-        marks[j] = f if mine else marks[j]
-        pixels += np.int32(mine)
-        gaps += np.int32(mine & gap)
-    states[q32, 3] += pixels if q32 == 0 else gaps
-    if not peak and q32 > 0:
-        states[q32, 0] += pixels - gaps
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _cosines(cos_i, cos_r, cos_l, alpha2, sun_up, sx, sy, sz, vx, vy, vz, nx, ny, nz):
-    """Directions to angles about the facet; alpha^2 by a polynomial in |n - h|^2 / 2 = 1 - cos alpha."""
-    for j in range(sx.size):
-        hx, hy, hz = sx[j] + vx[j], sy[j] + vy[j], sz[j] + vz[j]
-        length = math.sqrt(hx * hx + hy * hy + hz * hz)
-        inverse = 1.0 / length
-        dx, dy, dz = nx[j] - hx * inverse, ny[j] - hy * inverse, nz[j] - hz * inverse
-        u = alpha2.dtype.type((dx * dx + dy * dy + dz * dz) * 0.5)
-        high = (((A8 * u + A7) * u + A6) * u + A5) * u + A4
-        alpha2[j] = ((((high * u + A3) * u + A2) * u + A1) * u + A0) * u
-        cos_i[j] = nx[j] * sx[j] + ny[j] * sy[j] + nz[j] * sz[j]
-        cos_r[j] = nx[j] * vx[j] + ny[j] * vy[j] + nz[j] * vz[j]
-        cos_l[j] = length * 0.5
-        sun_up[j] = sz[j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _set(values, kind, q32, value):
-    """Set the value of the pixels of one material."""
+@njit(**STEP)
+def _set_rules(whole, real, table, q):
+    """The rules of one material for its pixels, which are to be assessed."""
+    kind, ways, bound = np.int32(q), np.int32(table.ways[q]), table.bound[q]
+    cos_min, cos_max, negligible, limit = table.cos_min[q], table.cos_max[q], table.negligible[q], table.share[q]
     for j in range(CHUNK):
-        values[j] = value if kind[j] == q32 else values[j]
+        mine = whole[KIND + j] == kind
+        real[COS_MIN + j] = cos_min if mine else real[COS_MIN + j]
+        real[COS_MAX + j] = cos_max if mine else real[COS_MAX + j]
+        real[NEGLIGIBLE + j] = negligible if mine else real[NEGLIGIBLE + j]
+        real[LIMIT + j] = limit if mine else real[LIMIT + j]
+        real[BOUND + j] = bound if mine else real[BOUND + j]
+        whole[WAYS + j] = ways if mine else whole[WAYS + j]
+        whole[ASSESS + j] = np.int32(1) if mine else whole[ASSESS + j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _want(assess, kind, missing, q32, count):
-    """The pixels of one material are to be assessed where there is data."""
-    for j in range(count):
-        assess[j] |= np.int32((kind[j] == q32) & (missing[j] == 0))
+@njit(**STEP)
+def _mark_known(whole):
+    """Flags and states that need no geometry; gaps are not to be assessed."""
+    for j in range(CHUNK):
+        gap, wanted = whole[MISSING + j] != 0, whole[ASSESS + j] != 0
+        none = whole[KIND + j] == 0
+        f = whole[MARKS + j] & (ON_ENTRY if wanted else QUALITY)
+        f |= (NO_MATERIAL if none else NO_FLAG) | (SATURATED if whole[SATURATES + j] != 0 else NO_FLAG)
+        whole[MARKS + j] = (whole[MARKS + j] & QUALITY) | NODATA if gap else f
+        whole[STATE + j] = REFUSED_STATE if gap | none else NEGLIGIBLE_STATE
+        whole[ASSESS + j] = np.int32(wanted & (not gap))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _assess(assess, cos_min, cos_max, cos_i, cos_r, marks):
+@njit(**STEP)
+def _aim(field, place, row, start, stop, aims):
+    """Put the vectors of a chunk, which may be one for all pixels, into a place of `aims`."""
+    for c in range(3):
+        line = aims[place + c * CHUNK : place + (c + 1) * CHUNK]
+        if field[c].size == 1:
+            value = field[c, 0, 0]
+            for j in range(CHUNK):
+                line[j] = value
+        else:
+            given = field[c, row, start:stop]
+            for j in range(given.size):
+                line[j] = given[j]
+
+
+@njit(**STEP)
+def _set_cosines(aims, real):
+    """Directions to angles about the facet; alpha^2 by a polynomial in |n - h|^2 / 2 = 1 - cos alpha.
+
+    1 / |s + v| is a float32 and one step of Newton: 4e-14 at a third of the time of a float64 root and quotient.
+    """
+    for j in range(CHUNK):
+        sx, sy, sz = aims[SUN + j], aims[SUN + CHUNK + j], aims[SUN + 2 * CHUNK + j]
+        vx, vy, vz = aims[VIEW + j], aims[VIEW + CHUNK + j], aims[VIEW + 2 * CHUNK + j]
+        nx, ny, nz = aims[NORMAL + j], aims[NORMAL + CHUNK + j], aims[NORMAL + 2 * CHUNK + j]
+        hx, hy, hz = sx + vx, sy + vy, sz + vz
+        square = hx * hx + hy * hy + hz * hz
+        guess = np.float64(ONE / np.sqrt(np.float32(square)))
+        inverse = guess * (1.5 - 0.5 * square * guess * guess)
+        dx, dy, dz = nx - hx * inverse, ny - hy * inverse, nz - hz * inverse
+        real[ALPHA2 + j] = (dx * dx + dy * dy + dz * dz) * 0.5
+        real[COS_I + j] = nx * sx + ny * sy + nz * sz
+        real[COS_R + j] = nx * vx + ny * vy + nz * vz
+        real[COS_L + j] = square * inverse * 0.5
+        real[SUN_UP + j] = sz
+    for j in range(CHUNK):
+        real[ALPHA2 + j] = _arccos2(real[ALPHA2 + j])
+
+
+@njit(**STEP)
+def _arccos2(u):
+    """arccos(1 - u)^2."""
+    high = (((A8 * u + A7) * u + A6) * u + A5) * u + A4
+    return ((((high * u + A3) * u + A2) * u + A1) * u + A0) * u
+
+
+@njit(**STEP)
+def _assess(whole, real):
     """Leave out pixels that are not lit, not seen, too steep or hidden, and flag why; the number that is left."""
-    for j in range(marks.size):
-        f = marks[j]
-        least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
-        most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
-        wanted = assess[j] != 0
-        lit, seen = cos_i[j] > ZERO, cos_r[j] > ZERO
-        steep = (least >= cos_min[j]) & (most <= cos_max[j])
+    total = np.int32(0)
+    for j in range(CHUNK):
+        f = whole[MARKS + j]
+        cos_i, cos_r = real[COS_I + j], real[COS_R + j]
+        least = cos_i if cos_i < cos_r else cos_r
+        most = cos_r if cos_i < cos_r else cos_i
+        wanted = whole[ASSESS + j] != 0
+        lit, seen = cos_i > ZERO, cos_r > ZERO
+        steep = (least >= real[COS_MIN + j]) & (most <= real[COS_MAX + j])
         free = lit & seen & steep & ((f & HIDDEN) == 0)
-        assess[j] = np.int32(wanted & free)
-        f |= NO_FLAG if free else NOT_ASSESSED
         f |= NO_FLAG if lit else SELF_SHADOW
         f |= NO_FLAG if seen else NOT_VIEWED
         f |= GRAZING if lit & seen & (not steep) else NO_FLAG
-        marks[j] = f if wanted else marks[j]
-    total = 0
-    for j in range(marks.size):
-        total += assess[j]
+        whole[MARKS + j] = f if wanted else whole[MARKS + j]
+        whole[STATE + j] = REFUSED_STATE if wanted & (not free) else whole[STATE + j]
+        whole[ASSESS + j] = np.int32(wanted & free)
+        total = np.int32(total + np.int32(wanted & free))
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _set_shape(assess, simplified, horizontal, cos_i, cos_r, cos_l, shape, sun_up, count):
+@njit(**STEP)
+def _set_shape(whole, real):
     """G / (cos_i cos_r), on the plane that R refers to; finite at grazing angles. The number of pixels with G < 1."""
-    attenuated = 0
-    for j in range(count):
-        good = assess[j] != 0
-        least = cos_i[j] if cos_i[j] < cos_r[j] else cos_r[j]
-        most = cos_r[j] if cos_i[j] < cos_r[j] else cos_i[j]
-        total = cos_i[j] + cos_r[j]
-        c2 = cos_l[j] * cos_l[j]
+    attenuated = np.int32(0)
+    for j in range(CHUNK):
+        good = whole[ASSESS + j] != 0
+        cos_i, cos_r, cos_l = real[COS_I + j], real[COS_R + j], real[COS_L + j]
+        least = cos_i if cos_i < cos_r else cos_r
+        most = cos_r if cos_i < cos_r else cos_i
+        total = cos_i + cos_r
+        c2 = cos_l * cos_l
         inside = least * total >= c2
-        attenuated += np.int32(good & (not inside))
-        whole = (simplified[j] != 0) | inside
-        numerator = ONE if whole else total
-        denominator = cos_i[j] * cos_r[j] if whole else most * c2
-        level = horizontal[j] != 0
-        numerator = numerator * (cos_i[j] if level else ONE)
-        denominator = denominator * (sun_up[j] if level else ONE)
-        shape[j] = (numerator if good else ZERO) / (denominator if good else ONE)
+        attenuated = np.int32(attenuated + np.int32(good & (not inside)))
+        all_of_it = ((whole[WAYS + j] & SIMPLIFIED) != 0) | inside
+        numerator = ONE if all_of_it else total
+        denominator = cos_i * cos_r if all_of_it else most * c2
+        level = (whole[WAYS + j] & LEVEL) != 0
+        numerator = numerator * (cos_i if level else ONE)
+        denominator = denominator * (real[SUN_UP + j] if level else ONE)
+        real[SHAPE + j] = (numerator if good else ZERO) / (denominator if good else ONE)
     return attenuated
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _set_amount(amounts, lobe, kind, q32, gain):
-    """Amount of the pixels of one material in one band."""
+@njit(**STEP)
+def _set_amounts(scratch, table, polynomials, peaks, skip):
+    """The reflectance to remove in each band; False, and none of it, if the chunk is out of every lobe.
+
+    Bands with the same w, n, k share the lobe. A chunk is out of it where the largest pi beta t1 F times the
+    exponential stays below the threshold everywhere, which one exponential tells if all bands have the same w.
+    """
+    aims, real, whole, power, amounts, present = scratch
+    may_skip = skip
+    for place in range(peaks):
+        may_skip &= table.one_w[present[place]]
+    for b in range(len(amounts)):
+        again = b == 0
+        for place in range(peaks):
+            again |= not table.shared[present[place], b]
+        if again:
+            if polynomials is None:
+                _set_lobe_by_equations(whole, real, aims, table.w[:, b], table.n[:, b], table.k[:, b])
+            else:
+                for place in range(peaks):
+                    q = present[place]
+                    _set_w2(whole, real, np.int32(q), table.w2[q, b])
+                _set_exponential(whole, real, power)
+                if may_skip and b == 0 and _is_outside(real):
+                    return False
+                for place in range(peaks):
+                    q = present[place]
+                    _set_lobe(whole, real, np.int32(q), polynomials[q, b], table.n[q, b], table.k[q, b])
+        for place in range(peaks):
+            q = present[place]
+            _set_amount(whole, real, amounts[b], np.int32(q), table.gain[q, b])
+    return True
+
+
+@njit(**STEP)
+def _set_lobe_by_equations(whole, real, aims, w, n, k):
+    """f_spec of all materials of a chunk in one band, on the plane that R refers to."""
     for j in range(CHUNK):
-        amounts[j] = gain * lobe[j] if kind[j] == q32 else amounts[j]
+        real[LOBE + j] = ZERO
+        if whole[ASSESS + j] != 0:
+            q = whole[KIND + j]
+            sun = (aims[SUN + j], aims[SUN + CHUNK + j], aims[SUN + 2 * CHUNK + j])
+            view = (aims[VIEW + j], aims[VIEW + CHUNK + j], aims[VIEW + 2 * CHUNK + j])
+            normal = (aims[NORMAL + j], aims[NORMAL + CHUNK + j], aims[NORMAL + 2 * CHUNK + j])
+            angles = geometry(sun, view, normal)
+            f = specular(angles, w[q], n[q], k[q], (whole[WAYS + j] & SIMPLIFIED) != 0)
+            real[LOBE + j] = f * angles[0] / sun[2] if (whole[WAYS + j] & LEVEL) != 0 else f
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _set_exponential(exponential, power_bits, power, w2, alpha2, shape):
+@njit(**STEP)
+def _set_w2(whole, real, kind, w2):
+    """w^2 of the pixels of one material."""
+    for j in range(CHUNK):
+        real[W2 + j] = w2 if whole[KIND + j] == kind else real[W2 + j]
+
+
+@njit(**STEP)
+def _set_exponential(whole, real, power):
     """exp(-w^2 alpha^2) times the shape: 2^x from the whole part of x as bits and a polynomial of the rest.
 
-    power : the memory of `power_bits`, read as float32.
+    power : the memory of whole[POWER:], read as float32.
     """
     for j in range(CHUNK):
-        x = w2[j] * alpha2[j] * MINUS_LOG2_E
-        x = x if x > LOWEST_EXPONENT else LOWEST_EXPONENT
-        whole = np.int32(x - HALF)  # x <= 0: rounds to the nearest
-        power_bits[j] = (whole + np.int32(127)) << np.int32(23)
-        exponential[j] = x - np.float32(whole)
+        x = real[W2 + j] * real[ALPHA2 + j] * MINUS_LOG2_E
+        above = x > LOWEST_EXPONENT
+        x = x if above else ZERO
+        nearest = np.int32(x - HALF)  # x <= 0
+        whole[POWER + j] = (nearest + np.int32(127)) << np.int32(23) if above else np.int32(0)
+        real[EXPONENTIAL + j] = x - np.float32(nearest)
     for j in range(CHUNK):
-        x = exponential[j]
+        x = real[EXPONENTIAL + j]
         p = (((((E6 * x + E5) * x + E4) * x + E3) * x + E2) * x + E1) * x + ONE
-        exponential[j] = p * power[j] * shape[j]
+        real[EXPONENTIAL + j] = p * power[j] * real[SHAPE + j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _is_outside(negligible, bound, exponential, count):
+@njit(**STEP)
+def _is_outside(real):
     """Whether no pixel of the chunk can have as much as its threshold to remove."""
     inside = np.int32(0)
-    for j in range(count):
-        inside |= np.int32(bound[j] * exponential[j] >= negligible[j] * BOUND_MARGIN)
+    for j in range(CHUNK):
+        inside |= np.int32(real[BOUND + j] * real[EXPONENTIAL + j] >= real[NEGLIGIBLE + j] * BOUND_MARGIN)
     return inside == 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _set_lobe(lobe, kind, cos_l, exponential, q32, c, n, k):
+@njit(**STEP)
+def _set_lobe(whole, real, kind, c, n, k):
     """f_spec of the pixels of one material: F times the exponential; F by polynomial or, where scale is 0, exact."""
     scale, shift = c[FRESNEL_DEGREE + 1], c[FRESNEL_DEGREE + 2]
     if scale == 0:
         for j in range(CHUNK):
-            if kind[j] == q32:
-                lobe[j] = fresnel(np.float64(cos_l[j]), n, k) * exponential[j]
-        return
-    f0, f1, f2, f3, f4, f5, f6 = c[0], c[1], c[2], c[3], c[4], c[5], c[6]
-    f7, f8, f9, f10, f11, f12 = c[7], c[8], c[9], c[10], c[11], c[12]
+            if whole[KIND + j] == kind:
+                real[LOBE + j] = fresnel(np.float64(real[COS_L + j]), n, k) * real[EXPONENTIAL + j]
+    else:
+        f0, f1, f2, f3, f4, f5, f6 = c[0], c[1], c[2], c[3], c[4], c[5], c[6]
+        f7, f8, f9, f10, f11, f12 = c[7], c[8], c[9], c[10], c[11], c[12]
+        for j in range(CHUNK):
+            x = real[COS_L + j] * scale + shift
+            f = (((((f12 * x + f11) * x + f10) * x + f9) * x + f8) * x + f7) * x + f6
+            f = (((((f * x + f5) * x + f4) * x + f3) * x + f2) * x + f1) * x + f0
+            real[LOBE + j] = f * real[EXPONENTIAL + j] if whole[KIND + j] == kind else real[LOBE + j]
+
+
+@njit(**STEP)
+def _set_amount(whole, real, amounts, kind, gain):
+    """Amount of the pixels of one material in one band."""
     for j in range(CHUNK):
-        x = cos_l[j] * scale + shift
-        f = (((((f12 * x + f11) * x + f10) * x + f9) * x + f8) * x + f7) * x + f6
-        f = (((((f * x + f5) * x + f4) * x + f3) * x + f2) * x + f1) * x + f0
-        lobe[j] = f * exponential[j] if kind[j] == q32 else lobe[j]
+        amounts[j] = gain * real[LOBE + j] if whole[KIND + j] == kind else amounts[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(amounts, line, scale, offset, assess, negligible, limit, hit, state, share):
+@njit(**STEP)
+def _clear(whole, real):
+    """Nothing weighed so far; a pixel that is not assessed has a threshold that nothing reaches."""
+    for j in range(CHUNK):
+        real[THRESHOLD + j] = real[NEGLIGIBLE + j] if whole[ASSESS + j] != 0 else ENDLESS
+        real[SHARE + j] = ZERO
+        whole[HIT + j] = 0
+        whole[OVER + j] = 0
+
+
+@njit(**STEP)
+def _weigh(amounts, line, scale, offset, whole, real):
     """One band's amounts against threshold and signal; amounts below the threshold become 0."""
     for j in range(line.size):
         a = amounts[j]
-        above = (assess[j] != 0) & (a >= negligible[j])
-        r = amounts.dtype.type(line[j]) * scale + offset
+        above = a >= real[THRESHOLD + j]
+        r = real.dtype.type(line[j]) * scale + offset
+        amounts[j] = a if above else ZERO
+        whole[HIT + j] |= np.int32(above)
+        whole[OVER + j] |= np.int32(above & ((a > real[LIMIT + j] * r) | (r <= ZERO)))
+
+
+@njit(**STEP)
+def _set_share(amounts, line, scale, offset, real):
+    """The largest share of the signal so far; 2 where there is something to take and no signal."""
+    for j in range(line.size):
+        a = amounts[j]
+        r = real.dtype.type(line[j]) * scale + offset
         bright = r > ZERO
         part = (a if bright else TWO) / (r if bright else ONE)
-        part = part if above else ZERO
-        share[j] = part if part > share[j] else share[j]
-        amounts[j] = a if above else ZERO
-        hit[j] |= np.int32(above)
-        state[j] |= np.int32(above & (part > limit[j]))
+        part = part if a > ZERO else ZERO
+        real[SHARE + j] = part if part > real[SHARE + j] else real[SHARE + j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _settle(hit, state, saturated, count):
+@njit(**STEP)
+def _settle(whole):
     """SPECULAR_STATE from what `_weigh` found in all bands; the number of pixels with something to remove."""
-    hits = 0
-    for j in range(count):
-        state[j] = hit[j] + ((state[j] | saturated[j]) & hit[j])
-        hits += hit[j]
+    hits = np.int32(0)
+    for j in range(CHUNK):
+        hit = whole[HIT + j]
+        over = (whole[OVER + j] | whole[SATURATES + j]) & hit
+        whole[STATE + j] |= hit + over
+        whole[TAKE + j] = np.int32((over == 0) | ((whole[WAYS + j] & (KEEP | BLANK)) == 0))
+        hits = np.int32(hits + hit)
     return hits
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _subtract(amounts, line, new_values, state, policy, clipped, steps, lowest, saturation, nodata, dodges, integer):
-    """One band less its amounts, rounded to stored steps and held above 0; `amounts` become what was taken."""
-    real = amounts.dtype
-    least, blank = lowest, real.type(nodata)
-    if integer:
-        for j in range(line.size):
-            step = amounts[j] * steps + HALF
-            new_values[j] = real.type(np.int32(step if step < MOST_STEPS else MOST_STEPS))
-    else:
-        for j in range(line.size):
-            new_values[j] = line.dtype.type(amounts[j] * steps)  # so that input - removed is exact in the file
+@njit(**STEP)
+def _subtract(amounts, line, rules, b, whole, real):
+    """One band less its amounts, in whole steps and held above 0; `amounts` become what was taken."""
+    steps, least, saturation = rules.steps[b], rules.lowest[b], rules.saturation[b]
+    dodges, integer, blank = rules.dodge, rules.integer, real.dtype.type(rules.nodata[0])
     for j in range(line.size):
-        value = real.type(line[j])
-        new = value - new_values[j]
+        value = real.dtype.type(line[j])
+        part = amounts[j] * steps
+        if integer is None:
+            part = real.dtype.type(line.dtype.type(part))  # so that input - removed is exact in the file
+        else:
+            part = part + HALF
+            part = real.dtype.type(np.int32(part if part < MOST_STEPS else MOST_STEPS))
+        new = value - part
         low = new < least
         floor = least if least < value else value
         new = floor if low else new
         dodge = dodges & (new == blank)
         new = new + ONE if dodge else new
         take = (amounts[j] > ZERO) & (value < saturation)
-        take = take & ((state[j] == 1) | (policy[j] == BEST))
-        clipped[j] |= np.int32(take & (low | dodge))
+        take = take & (whole[TAKE + j] != 0)
+        whole[CLIPS + j] |= np.int32(take & (low | dodge))
         new = new if take else value
-        new_values[j] = new
         amounts[j] = value - new
-    if integer:
-        for j in range(line.size):
-            line[j] = np.int32(new_values[j])
-    else:
-        for j in range(line.size):
-            line[j] = new_values[j]
+        line[j] = new
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _mark_states(marks, state, clipped, policy):
-    """Flag what became of the pixels; the number of those to be blanked."""
-    blanks = 0
-    for j in range(marks.size):
-        f = marks[j] | (CLIPPED if clipped[j] != 0 else NO_FLAG)
-        f |= CORRECTED if state[j] == 1 else NO_FLAG
-        marks[j] = f | (UNCORRECTABLE if state[j] == 2 else NO_FLAG)
-        blanks += np.int32((state[j] == 2) & (policy[j] == BLANK))
+@njit(**STEP)
+def _keep(amounts, taken, whole):
+    """Write down what was taken from one band."""
+    for j in range(taken.size):
+        taken[j] = amounts[j] if whole[HIT + j] != 0 else taken[j]
+
+
+@njit(**STEP)
+def _count_blanks(whole):
+    """The number of pixels that are to be nodata."""
+    blanks = np.int32(0)
+    for j in range(CHUNK):
+        blanks = np.int32(
+            blanks + np.int32((whole[STATE + j] == UNCORRECTABLE_STATE) & ((whole[WAYS + j] & BLANK) != 0))
+        )
     return blanks
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _blank(line, state, policy, nodata):
+@njit(**STEP)
+def _blank(line, nodata, whole):
     """Nodata where a pixel is uncorrectable and its material wants it so."""
     for j in range(line.size):
-        if state[j] == 2 and policy[j] == BLANK:
+        if whole[STATE + j] == UNCORRECTABLE_STATE and (whole[WAYS + j] & BLANK) != 0:
             line[j] = nodata
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _keep(amounts, taken, hit):
-    """Write down what was taken from one band."""
-    for j in range(taken.size):
-        taken[j] = amounts[j] if hit[j] != 0 else taken[j]
+@njit(**STEP)
+def _store(marks, whole):
+    """Flags of a chunk, complete."""
+    for j in range(marks.size):
+        f = whole[MARKS + j] | (CLIPPED if whole[CLIPS + j] != 0 else NO_FLAG)
+        marks[j] = f | (whole[STATE + j] << STATE_SHIFT)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _count_states(kind, missing, assess, state, q32, count, states):
-    """Pixels of one material by state, of those with data."""
-    negligible, corrected, uncorrectable, refused = 0, 0, 0, 0
+@njit(**STEP)
+def _count_states(whole, kind, count, states):
+    """Pixels of one material by state."""
+    negligible, corrected, uncorrectable, refused = np.int32(0), np.int32(0), np.int32(0), np.int32(0)
     for j in range(count):
-        mine = (kind[j] == q32) & (missing[j] == 0)
-        done = mine & (assess[j] != 0)
-        refused += np.int32(mine & (assess[j] == 0))
-        negligible += np.int32(done & (state[j] == 0))
-        corrected += np.int32(done & (state[j] == 1))
-        uncorrectable += np.int32(done & (state[j] == 2))
-    states[q32, 0] += negligible
-    states[q32, 1] += corrected
-    states[q32, 2] += uncorrectable
-    states[q32, 3] += refused
+        mine, state = whole[KIND + j] == kind, whole[STATE + j]
+        negligible = np.int32(negligible + np.int32(mine & (state == 0)))
+        corrected = np.int32(corrected + np.int32(mine & (state == 1)))
+        uncorrectable = np.int32(uncorrectable + np.int32(mine & (state == 2)))
+        refused = np.int32(refused + np.int32(mine & (state == 3)))
+    states[kind, 0] += negligible
+    states[kind, 1] += corrected
+    states[kind, 2] += uncorrectable
+    states[kind, 3] += refused
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _tally_geometry(kind, assess, cos_i, alpha2, count, tally):
+@njit(**STEP)
+def _tally_geometry(whole, real, count, tally):
     """Histograms of the angle of incidence and of the facet tilt over the assessed pixels of a chunk."""
+    for j in range(CHUNK):
+        u = ONE - real[COS_I + j]
+        incidence = np.sqrt(_arccos2(u if u > ZERO else ZERO)) * QUARTERS_PER_RAD
+        tilt = np.sqrt(real[ALPHA2 + j]) * DEGREES_PER_RAD
+        real[TILT + j] = tilt
+        assess = whole[ASSESS + j] != 0
+        whole[INCIDENCE_BIN + j] = np.int32(incidence if assess & (incidence < LAST_QUARTER) else LAST_QUARTER)
+        whole[TILT_BIN + j] = np.int32(tilt * TEN if assess & (tilt * TEN < LAST_TENTH) else LAST_TENTH)
     for j in range(count):
-        if assess[j] != 0:
-            q = kind[j]
-            incidence = math.acos(min(1.0, np.float64(cos_i[j]))) * DEG_PER_RAD
-            tilt = math.sqrt(np.float64(alpha2[j])) * DEG_PER_RAD
-            tally.incidence[q, min(359, int(incidence * 4))] += 1
-            tally.tilt[q, min(899, int(tilt * 10))] += 1
-            tally.extremes[q, 0] = min(tally.extremes[q, 0], tilt)
+        if whole[ASSESS + j] != 0:
+            q = whole[KIND + j]
+            tally.incidence[q, whole[INCIDENCE_BIN + j]] += 1
+            tally.tilt[q, whole[TILT_BIN + j]] += 1
+            tally.extremes[q, 0] = min(tally.extremes[q, 0], np.float64(real[TILT + j]))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _tally_removed(kind, hit, simplified, cos_i, cos_r, cos_l, share, amount, count, rules, tally):
+@njit(**STEP)
+def _tally_removed(whole, real, amounts, count, scale, tally):
     """Share, removed reflectance and the difference that G makes, over the pixels inside the lobe."""
     for j in range(count):
-        if hit[j] != 0:
-            q = kind[j]
-            part = min(1.0, np.float64(share[j]))
+        if whole[HIT + j] != 0:
+            q = whole[KIND + j]
+            part = min(1.0, np.float64(real[SHARE + j]))
             tally.share[q, int(part * 200)] += 1
             tally.extremes[q, 1] = max(tally.extremes[q, 1], part)
-            for b in range(rules.scale.size):
-                taken = np.float64(amount[b, j]) * np.float64(rules.scale[b])
+            for b in range(scale.size):
+                taken = np.float64(amounts[b, j]) * np.float64(scale[b])
                 tally.removed[q, b] += np.int64(taken * TWO_TO_32 + 0.5)
-            g = attenuation(np.float64(cos_i[j]), np.float64(cos_r[j]), np.float64(cos_l[j]))
-            change = 1 - g if simplified[j] != 0 else 1 / g - 1
+            g = attenuation(np.float64(real[COS_I + j]), np.float64(real[COS_R + j]), np.float64(real[COS_L + j]))
+            change = 1 - g if (whole[WAYS + j] & SIMPLIFIED) != 0 else 1 / g - 1
             tally.attenuated[1] = max(tally.attenuated[1], part * change)

@@ -189,7 +189,7 @@ def correct_block(
 ) -> None:
     """Take the specular part out of a block of an image, in place; slow, as the equations stand, in float64.
 
-    Arguments as in kernels.correct_block. `exact` and `skip` of the options mean nothing here.
+    Arguments as in kernels.correct_block. `skip` of the options means nothing here.
     """
     from tscorr import kernels as bits  # flag values; numba is not imported before it is needed
 
@@ -204,7 +204,7 @@ def correct_block(
     flags[~missing & (material == 0)] |= bits.NO_MATERIAL | bits.NOT_ASSESSED
     flags[~missing & full.any(axis=0)] |= bits.SATURATED
 
-    _, _, first_row, stride = options
+    _, first_row, stride = options
     for q in range(table.peak.size):
         where = np.nonzero((material == q) & ~missing)
         tally.states[q, 3] += np.count_nonzero((material == q) & missing)
@@ -216,7 +216,7 @@ def correct_block(
         angles = geometry(*vectors)
         f = flags[where]
         blocked = _not_assessable(angles, f, table, q, bits)
-        amount = np.where(blocked, 0, _specular_reflectance(angles, vectors[0][2], table, q))
+        amount = np.where(blocked, 0, _specular_reflectance(angles, vectors[0][2], table, q, bits))
         amount[~(amount >= table.negligible[q])] = 0
 
         values, saturated = stored[all_bands], full[all_bands]
@@ -226,14 +226,14 @@ def correct_block(
         f[hit & ~over] |= bits.CORRECTED
         f[over] |= bits.UNCORRECTABLE
 
-        take = (amount > 0) & ~saturated & (~over | (table.policy[q] == bits.BEST))
+        take = (amount > 0) & ~saturated & (~over | (not table.ways[q] & (bits.KEEP | bits.BLANK)))
         new, clipped = _subtract(values, amount, rules)
         f[(take & clipped).any(axis=0)] |= bits.CLIPPED
         new = np.where(take, new, values).astype(image.dtype)
         image[all_bands] = new
         if removed.shape[1]:
             removed[all_bands] = values - new
-        if table.policy[q] == bits.BLANK:
+        if table.ways[q] & bits.BLANK:
             image[:, where[0][over], where[1][over]] = rules.nodata[0]
         flags[where] = f
 
@@ -249,7 +249,7 @@ def correct_block(
             tallied,
             share,
             taken,
-            bool(table.simplified[q]),
+            bool(table.ways[q] & bits.SIMPLIFIED),
         )
 
 
@@ -266,11 +266,11 @@ def _not_assessable(angles: Geometry, flags: Array, table: Any, q: int, bits: An
     return blocked
 
 
-def _specular_reflectance(angles: Geometry, sun_up: Array, table: Any, q: int) -> Array:
+def _specular_reflectance(angles: Geometry, sun_up: Array, table: Any, q: int, bits: Any) -> Array:
     """B = pi beta c t1 f_spec for each band; c refers it to the horizontal plane. (bands, pixels)"""
     w, n, k = (getattr(table, name)[q, :, None] for name in ("w", "n", "k"))
-    f_spec = specular(angles, w, n, k, simplified=bool(table.simplified[q]))
-    c = angles.cos_i / sun_up if table.horizontal[q] else 1.0
+    f_spec = specular(angles, w, n, k, simplified=bool(table.ways[q] & bits.SIMPLIFIED))
+    c = angles.cos_i / sun_up if table.ways[q] & bits.LEVEL else 1.0
     return table.gain[q, :, None] * c * f_spec
 
 

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 from tscorr import kernels, reference
 from tscorr.correction.flags import PixelFlag
 from tscorr.correction.rules import Stored
-from tscorr.correction.tables import Entry, computed_precision, material_table, new_tally, pixel_rules
+from tscorr.correction.tables import (
+    Entry,
+    computed_precision,
+    fresnel_polynomials,
+    material_table,
+    new_tally,
+    pixel_rules,
+)
 from tscorr.errors import InputError
 
 Array = NDArray[Any]
@@ -66,6 +73,8 @@ class _Engine:
 
     precision: str
     table: kernels.MaterialTable
+    polynomials: Array | None
+    """of the Fresnel reflectance, where they stand in for the equations"""
     mine: Array
     """bool (materials,): which rows of the table are its own"""
 
@@ -103,7 +112,8 @@ class Corrector:
     def _engine(precision: str, mine: Array, materials: Sequence[Entry], stored: Stored) -> _Engine:
         real = np.float32 if precision == "fast" else np.float64
         table = material_table(materials, len(stored.scale), real)
-        return _Engine(precision, table._replace(peak=table.peak & mine), mine)
+        polynomials = fresnel_polynomials(materials, len(stored.scale)) if precision == "fast" else None
+        return _Engine(precision, table._replace(peak=table.peak & mine), polynomials, mine)
 
     @property
     def peaks(self) -> Array:
@@ -146,9 +156,7 @@ class Corrector:
         first_row: int,
     ) -> None:
         real = np.float32 if engine.precision == "fast" else np.float64
-        correct_block = reference.correct_block if engine.precision == "reference" else kernels.correct_block
-        options = np.array([engine.precision == "exact", self.skip, first_row, self.tally_stride], dtype=np.int64)
-        correct_block(
+        block = (
             inputs.image,
             removed,
             flags,
@@ -157,10 +165,14 @@ class Corrector:
             np.ascontiguousarray(inputs.view, np.float64),
             np.ascontiguousarray(inputs.normal, np.float64),
             engine.table,
-            self._pixels[np.dtype(real)],
-            tally,
-            options,
         )
+        rules = self._pixels[np.dtype(real)]
+        options = np.array([self.skip, first_row, self.tally_stride], dtype=np.int64)
+        if engine.precision == "reference":
+            reference.correct_block(*block, rules, tally, options)
+        else:
+            scratch = kernels.new_scratch(len(inputs.image), real)
+            kernels.correct_block(*block, engine.polynomials, rules, tally, scratch, options)
 
 
 def class_rows(classes: Array, rows: Mapping[int, int]) -> Array:
