@@ -1,13 +1,14 @@
 """What tscorr weighs and how fast it starts: `python tests/benchmarks/footprint.py`.
 
 MB of each package that `pip install tscorr` brings, with what that brings; start of some commands as multiples of the
-start of Python alone, the best of several interleaved runs, and the heavy packages that each command loads.
+start of Python alone (time of the processor, the best of several interleaved runs), and the heavy packages that each
+command loads.
 """
 
 import re
+import resource
 import subprocess
 import sys
-import time
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
@@ -68,10 +69,11 @@ def loaded(code):
 
 
 def seconds(code):
-    """Wall time of a start."""
-    start = time.perf_counter()
+    """Time of the processor that a start takes."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=True)
-    return time.perf_counter() - start
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def main():
