@@ -208,12 +208,13 @@ def test_blocks_of_any_shape_make_one_envi_file(tmp_path, interleave):
 def test_an_envi_file_that_lost_bytes_does_not_pass(tmp_path, damage):
     like = rasters.describe(write_envi(tmp_path / "image.dat", values_of("int16"), "bip"))
     writer = rasters.EnviWriter(tmp_path / "x.dat", like, rasters.Layer(like.names, "int16"))
-    writer.write(Block(0, 0, *SHAPE), values_of("int16"))
+    for block in blocks(SHAPE, (5, SHAPE[1])):
+        writer.write(block, values_of("int16")[:, *block.slices])
     if damage == "header":
         (tmp_path / "x.hdr").write_text("ENVI\n")
     else:
         content = (tmp_path / "x.dat").read_bytes()
-        content = content[:-40] if damage == "cut" else content[:100] + bytes(8) + content[108:]
+        content = content[:-40] if damage == "cut" else content[:-100] + bytes(8) + content[-92:]
         (tmp_path / "x.dat").write_bytes(content)
     with pytest.raises(OutputError, match=r"x\.dat does not read back as written; is the disk full"):
         writer.close()
@@ -318,7 +319,7 @@ def test_bad_bands_are_left_as_they_are_and_decide_nothing(tmp_path, output, jun
         "data_ignore_value": -9999,
     }
     image = write_envi(tmp_path / "image.dat", values, "bil", **fields)
-    folder = corrected(tmp_path, image, {"saturation": 20000}, format=output)
+    folder = corrected(tmp_path, image, {"saturation": [100, 20000, 100, 20000]}, format=output)
     with rasterio.open(rasters.result(folder, "corrected").path) as file:
         result = file.read()
     with rasterio.open(rasters.result(folder, "removed").path) as file:
@@ -331,8 +332,11 @@ def test_bad_bands_are_left_as_they_are_and_decide_nothing(tmp_path, output, jun
     tif = write_raster(good / "image.tif", values[[1, 3]], crs=UTM)
     with rasterio.open(tif, "r+") as file:
         file.scales = (1e-4,) * 2
-    with rasterio.open(corrected(good, tif) / "corrected.tif") as file:
+    expected = corrected(good, tif)
+    with rasterio.open(expected / "corrected.tif") as file:
         np.testing.assert_array_equal(file.read(), result[[1, 3]])
+    with rasterio.open(expected / "flags.tif") as one, rasterio.open(rasters.result(folder, "flags").path) as other:
+        np.testing.assert_array_equal(one.read(), other.read())
     if output == "envi":
         assert read_envi(folder / "corrected.dat").numbers("bbl") == [0, 1, 0, 1]
 

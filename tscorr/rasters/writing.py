@@ -52,7 +52,6 @@ class Writer:
                 "nodata": layer.nodata,
                 "bigtiff": "if_safer",
                 "sparse_ok": True,
-                **({} if layer.palette is None else {"photometric": "palette"}),
             },
             np.dtype(layer.dtype),
         )
