@@ -318,3 +318,13 @@ def test_without_dask_the_error_names_what_to_install(inputs, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match=r"needs Dask: pip install tscorr\[dask\]"):
         batch.run(config_of(inputs, "without"), scheduler="tcp://127.0.0.1:1")
+
+
+def test_a_scheduler_that_is_lost_on_the_way_is_one_clear_error(cluster, inputs, monkeypatch):
+    def lost(*_):
+        raise distributed.comm.CommClosedError("stream is closed")
+
+    monkeypatch.setattr(driver, "_check_workers", lost)
+    with pytest.raises(ConfigError, match=r"the scheduler tcp://.* was lost: stream is closed"):
+        batch.run(config_of(inputs, "lost"), scheduler=cluster.scheduler_address)
+    assert hidden(inputs / "lost") == []

@@ -80,6 +80,7 @@ def _connected(address: str) -> Iterator[Any]:
     """A client of the scheduler."""
     try:
         from distributed import Client
+        from distributed.comm import CommClosedError
     except ImportError:
         raise ConfigError(f"the scheduler {address} needs Dask: pip install tscorr[dask]") from None
     try:
@@ -94,6 +95,8 @@ def _connected(address: str) -> Iterator[Any]:
         ) from None
     try:
         yield client
+    except CommClosedError as error:
+        raise ConfigError(f"the scheduler {address} was lost: {error}") from None
     finally:
         client.close(timeout=CONNECT_S)
 
@@ -121,6 +124,7 @@ def _job(scene: Scene) -> Any:
         holder=(target_of(scene).parent / LOCK).read_text(encoding="utf-8"),
         replaced=manifest.stat().st_mtime_ns if manifest.exists() else 0,
         split_mpixel=scene.config.run.split_mpixel,
+        version=__version__,
     )
 
 
@@ -129,9 +133,7 @@ def _check_workers(client: Any, jobs: Sequence[Any]) -> None:
     from tscorr.batch import tasks
 
     inputs = sorted({stamp for job in jobs for stamp in job.inputs})
-    job = jobs[0]
-    limit_mb = job.settings["run"]["memory_limit_mb"]
-    answers = client.run(tasks.look, inputs, job.output, job.holder, __version__, limit_mb, on_error="return")
+    answers = client.run(tasks.look, inputs, jobs[0], on_error="return")
     if not answers:
         log.warning("the scheduler %s has no workers yet; waiting for one", client.scheduler.address)
     problems = [problem for address, answer in answers.items() for problem in _problems(address, answer)]

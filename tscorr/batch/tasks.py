@@ -48,6 +48,8 @@ class Job:
     replaced: int
     """time of change of the manifest that stood in the scene's place at the start [ns], or 0"""
     split_mpixel: float
+    version: str
+    """of tscorr, where the run is"""
 
     @property
     def output(self) -> Path:
@@ -65,20 +67,25 @@ class OneSceneAtATime(WorkerPlugin):  # type: ignore[misc] # distributed is Any 
         await worker.set_resources(**{TURN: 1})
 
 
-def look(
-    inputs: Iterable[Stamp], output: Path, holder: str, version: str, memory_limit_mb: int, dask_worker: Worker
-) -> list[str]:
-    """What keeps a worker from taking part, one sentence each; empty where nothing does."""
-    problems = [*unseen(inputs), *_output_problems(output, holder)]
-    if version != __version__:
-        problems.append(f"has tscorr {__version__}; this is {version}: allowed is one version on all machines")
-    limit = dask_worker.memory_manager.memory_limit
-    if limit and limit < memory_limit_mb * 1e6:
+def look(inputs: Iterable[Stamp], job: Job, dask_worker: Worker) -> list[str]:
+    """What keeps a worker from taking part, one sentence each; empty where nothing does.
+
+    inputs : of all jobs; `job` is any one of them.
+    """
+    problems = [*unseen(inputs), *_output_problems(job.output, job.holder)]
+    if job.version != __version__:
+        problems.append(f"has tscorr {__version__}; this is {job.version}: allowed is one version on all machines")
+    limit, needed_mb = dask_worker.memory_manager.memory_limit, job.settings["run"]["memory_limit_mb"]
+    if limit and limit < needed_mb * 1e6:
         problems.append(
-            f"may use {limit / 1e6:.0f} MB of memory; [run] memory_limit_mb = {memory_limit_mb}: allowed is no more "
-            f"than a worker has"
+            f"may use {limit / 1e6:.0f} MB of memory; [run] memory_limit_mb = {needed_mb}: allowed is no more than a "
+            f"worker has"
         )
-    return [f"worker {dask_worker.address} on {socket.gethostname()} {problem}" for problem in problems]
+    return [f"{_name(dask_worker)} {problem}" for problem in problems]
+
+
+def _name(worker: Worker) -> str:
+    return f"worker {worker.address} on {socket.gethostname()}"
 
 
 def stamp(path: Path) -> Stamp:
@@ -153,15 +160,14 @@ def join_strips(job: Job, started: float, parts: Iterable[None]) -> dict[str, An
 def _scene_of(job: Job) -> Scene:
     """The scene as this worker sees it; its threads are those of the worker. Raises InputError where it is another."""
     worker = get_worker()
-    here = f"worker {worker.address} on {socket.gethostname()}"
-    if problems := [*unseen(job.inputs), *_output_problems(job.output, job.holder)]:
-        raise InputError(f"{here} {problems[0]}")
     settings = Config.model_validate(job.settings)
+    if problems := look(job.inputs, job, worker):
+        raise InputError("\n".join(problems))
     run = settings.run.model_copy(update={"workers": worker.state.nthreads})
     settings = settings.model_copy(update={"run": run})
     scene = plan_scene(settings.scenes[0], settings, library_of(settings), job.only)
     if resume_key(scene) != job.key:
-        raise InputError(f"{here} finds other headers, materials or links to files than this run did")
+        raise InputError(f"{_name(worker)} finds other headers, materials or links to files than this run did")
     return scene
 
 
