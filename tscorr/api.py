@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tscorr import reference
-from tscorr.correction import BlockInputs, Corrector, Rules, Stored, class_rows
+from tscorr.correction import BlockInputs, Corrector, Rules, Stored, check_ratio, class_rows
 from tscorr.errors import InputError
 from tscorr.materials import Material, material
 
@@ -49,12 +49,15 @@ class CorrectionResult:
 
     corrected, removed : (bands, rows, cols), of the type of the input; input - removed = corrected.
     flags : uint16 (rows, cols), bits of `PixelFlag`.
-    Arrays of numpy, or of xarray where the image was one.
+    sigma : float32, of the shape of `corrected`: 1 sigma of the corrected reflectance factor; None if not asked for.
+    Arrays of numpy, or of xarray where the image was one. With method = "reference" `removed` of an unsigned image
+    is of a signed type, since it can be negative.
     """
 
     corrected: Array
     removed: Array
     flags: Array
+    sigma: Array | None = None
 
 
 def correct(
@@ -67,12 +70,17 @@ def correct(
     *,
     shadowed: ArrayLike | None = None,
     hidden: ArrayLike | None = None,
+    weight: ArrayLike | None = None,
     wavelength_um: Sequence[float] | None = None,
     scale: float = 1.0,
     offset: float = 0.0,
     nodata: float | None = None,
     saturation: float | None = None,
     rules: Rules | None = None,
+    uncertainty: bool = False,
+    image_noise: tuple[float, float] = (0.0, 0.0),
+    normal_sigma_deg: ArrayLike | None = None,
+    direction_sigma_deg: float = 0.0,
     skip: bool = True,
 ) -> CorrectionResult:
     """An image without its specular part.
@@ -83,9 +91,14 @@ def correct(
     materials : material, or name of a built-in one, for each class; pixels of other classes are left alone.
     sun, view, normal : unit vectors east, north, up: (3,) or (3, rows, cols); normal is up by default.
     shadowed, hidden  : bool (rows, cols), where something stands before the sun or before the sensor.
+    weight    : float (rows, cols), the part of a pixel that is its material; by default all of it.
     rules     : how to correct; by default R refers to the horizontal plane and all light is direct.
-    Raises InputError where shapes or types do not fit. The input is not changed. A DataArray of xarray comes back as
-    DataArrays with its dimensions, (bands, rows, cols) or (rows, cols) in this order, and coordinates.
+    uncertainty : say how sure the result is, from the errors of the material and of `rules`, and from these:
+    image_noise : a, b of 1 sigma a + b R. normal_sigma_deg, direction_sigma_deg: 1 sigma of the normal, a number or
+                (rows, cols), and of the direction to the sensor, along each of two axes across them.
+    Raises InputError where shapes or types do not fit, or where method = "ratio" lacks the t0 of a band. The input is
+    not changed. A DataArray of xarray comes back as DataArrays with its dimensions, (bands, rows, cols) or
+    (rows, cols) in this order, and coordinates.
 
     The sun in the south and the sensor in the north, both at 40 degrees, over a tiled roof and the street beside it:
 
@@ -113,6 +126,8 @@ def correct(
     entries = []
     for entry in materials.values():
         surface = material(entry) if isinstance(entry, str) else entry
+        if settings.method == "ratio" and surface.has_peak:
+            check_ratio(surface, wavelength_um, bands)
         entries.append((surface, surface.at(wavelength_um, bands), settings))
     stored = Stored(
         dtype=cube.dtype,
@@ -120,6 +135,8 @@ def correct(
         offset=(offset,) * bands,
         nodata=nodata,
         saturation=None if saturation is None else (saturation,) * bands,
+        noise=(image_noise,),
+        direction_sigma_deg=direction_sigma_deg,
     )
     rows = {value: row for row, value in enumerate(materials, start=1)}
     inputs = BlockInputs(
@@ -130,21 +147,32 @@ def correct(
         normal=_vectors("normal", [0, 0, 1] if normal is None else normal, shape),
         shadowed=None if shadowed is None else np.broadcast_to(np.asarray(shadowed, dtype=bool), shape),
         hidden=None if hidden is None else np.broadcast_to(np.asarray(hidden, dtype=bool), shape),
+        weight=None if weight is None else np.broadcast_to(np.asarray(weight, np.float32), shape),
+        normal_sigma_deg=None if normal_sigma_deg is None else _field(normal_sigma_deg, shape),
     )
-    result = Corrector(entries, stored, skip=skip)(inputs)
+    corrector = Corrector(entries, stored, skip=skip, uncertainty=uncertainty, weighted=weight is not None)
+    result = corrector(inputs)
     assert result.removed is not None
-    if image.ndim == 2:
-        return _labelled(result.corrected[0], result.removed[0], result.flags, reflectance_factor)
-    return _labelled(result.corrected, result.removed, result.flags, reflectance_factor)
+    whole = slice(None) if image.ndim == 3 else 0
+    sigma = None if result.sigma is None else result.sigma[whole]
+    return _labelled(result.corrected[whole], result.removed[whole], result.flags, sigma, reflectance_factor)
 
 
-def _labelled(corrected: Array, removed: Array, flags: Array, image: Any) -> CorrectionResult:
+def _labelled(corrected: Array, removed: Array, flags: Array, sigma: Array | None, image: Any) -> CorrectionResult:
     """The arrays with the labels of the image where that is a DataArray; nobody who has one lacks xarray."""
     xarray = sys.modules.get("xarray")
     if xarray is None or not isinstance(image, xarray.DataArray):
-        return CorrectionResult(corrected, removed, flags)
+        return CorrectionResult(corrected, removed, flags, sigma)
     of_band = image.isel(dict.fromkeys(image.dims[:-2], 0), drop=True).drop_attrs()
-    return CorrectionResult(image.copy(data=corrected), image.copy(data=removed), of_band.copy(data=flags))
+    labelled_sigma = None if sigma is None else image.copy(data=sigma)
+    labelled_flags = of_band.copy(data=flags)
+    return CorrectionResult(image.copy(data=corrected), image.copy(data=removed), labelled_flags, labelled_sigma)
+
+
+def _field(values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """A number as (1, 1), or an array of the shape of the pixels."""
+    field = np.asarray(values, np.float32)
+    return field.reshape(1, 1) if field.ndim == 0 else np.broadcast_to(field, shape)
 
 
 def _vectors(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

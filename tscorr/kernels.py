@@ -178,6 +178,70 @@ class Tally(NamedTuple):
     """int64 (1,): assessed pixels whose lobe was not computed, because it is provably negligible"""
 
 
+# For `Extras`.
+UNCERTAIN = np.uint16(1024)
+SUBTRACT, RATIO, REFERENCE = 0, 1, 2
+SKY_DEGREE, VARIANCE_DEGREE = 12, 5
+
+
+class Extras(NamedTuple):
+    """What only some runs ask of `correct_block`. Arrays (materials, bands) unless said otherwise."""
+
+    sigma: Any
+    """float32 (bands, rows, cols): 1 sigma of the corrected reflectance factor is left here; of no rows: not wanted"""
+    weight: Any
+    """float32 (rows, cols), or (1, 1): the part of a pixel that is its material"""
+    scatter: Any
+    """float32 (rows, cols), or (1, 1): 1 sigma of the normal along each of two axes [deg]"""
+    own_scatter: Any
+    """(m,): the same for a whole material; nan: as `scatter` says"""
+    simple: bool
+    """no material has a method, a sky, an average or a scatter of its own"""
+    averaged: Any
+    """bool (m,): the lobe is averaged over the scatter of the normals"""
+    method: Any
+    """int64 (m,): SUBTRACT, RATIO or REFERENCE"""
+    noise: Any
+    """(bands, 2): 1 sigma of the image is a + b R"""
+    view_variance: Any
+    """(1,): of the direction to the sensor, along each of two axes [rad^2]"""
+    t0: Any
+    t1: Any
+    beta: Any
+    """direct fraction"""
+    beta_sigma: Any
+    covariance: Any
+    """(m, bands, 5, 5): of t0, t1, w, n, k"""
+    variance: Any
+    """(m, bands, 2 VARIANCE_DEGREE + 5): relative variance of the lobe, for `ratio` of the lobe over t0, from the
+    covariance: c0(x) + c1(x) alpha^2 + c2 alpha^4 with polynomials c0, c1 in x = cos_l * scale + shift; then c2,
+    scale, shift"""
+    same_variance: Any
+    """bool: w and `variance` are those of the band before"""
+    sky: Any
+    """(m, bands, SKY_DEGREE + 3): polynomial of t1 times the albedo of the lobe in x = cos_r * scale + shift,
+    lowest power first, then scale and shift; 0 where the sky's part is left in"""
+    has_sky: Any
+    """bool (m,): the sky's part is taken away too, also in shadow"""
+    sky_bound: Any
+    """(m,): no band's sky part is larger"""
+    sky_sigma: Any
+    """relative 1 sigma of the albedo of the lobe"""
+    reference: Any
+    reference_sky: Any
+    """the specular reflectance factor from sun and sky at the reference geometry, which `REFERENCE` adds back"""
+    reference_gradient: Any
+    """(m, bands, 5): derivatives of ln(t1 f_spec) there by t0, t1, w, n, k"""
+    parts: Any
+    """(m, bands, 8): 1 - beta, pi t0 beta, pi t0 (1 - beta), `reference`, `reference_sky`, beta_sigma / beta and
+    beta_sigma where the variance does not hold it already, `sky_sigma`"""
+    cross: Any
+    """(m, bands, VARIANCE_DEGREE + 3): relative covariance of the lobe and the one at the reference geometry:
+    c0(x) + c1 alpha^2; then c1, and the relative variance of the latter"""
+    highest: Any
+    """(1,): largest stored value that a correction may reach"""
+
+
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

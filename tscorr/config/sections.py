@@ -16,7 +16,8 @@ from pydantic import (
 
 from tscorr.errors import nearest
 
-Product = Literal["corrected", "flags", "removed", "azimuthal_width", "angles"]
+Product = Literal["corrected", "flags", "removed", "uncertainty", "azimuthal_width", "angles"]
+Method = Literal["subtract", "ratio", "reference"]
 
 
 def _numbers(value: Any, numbers: ValidatorFunctionWrapHandler) -> Any:
@@ -61,10 +62,35 @@ class Model(Section):
     )
 
 
+def _noise(value: Any, numbers: ValidatorFunctionWrapHandler) -> Any:
+    """One message instead of one for each half of the union."""
+    try:
+        return numbers(value)
+    except ValidationError:
+        raise ValueError("allowed is [a, b], or a list of such pairs, one a band, none below 0") from None
+
+
+NotNegative = Annotated[float, Field(ge=0)]
+Noise = tuple[NotNegative, NotNegative]
+
+
+class Reference(Section):
+    """`reference` of [correction]: the directions that the specular part is normalised to."""
+
+    solar_zenith_deg: Annotated[float, Field(ge=0, le=75)] = 45.0
+    view_zenith_deg: Annotated[float, Field(ge=0, le=75)] = 0.0
+    relative_azimuth_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
+
+
 class Correction(Section):
     """[correction]: what is taken away, and what is done where that cannot be right."""
 
-    method: Literal["subtract"] = Field("subtract", description="take the specular reflectance away")
+    method: Method = Field(
+        "subtract",
+        description="take the specular reflectance away; ratio: by the material's own share of it; "
+        "reference: and add what level ground shows at the reference directions",
+    )
+    reference: Reference = Field(Reference(), description="directions about level ground for method reference")
     negligible_reflectance: Annotated[float, Field(ge=0, le=1)] | None = Field(
         None,
         description="below this nothing is removed; default: half a stored step (5e-5 for floating point)",
@@ -82,21 +108,47 @@ class Correction(Section):
         "horizontal", description="the plane that the reflectance of the image refers to"
     )
     direct_fraction: PerBand = Field(1.0, description="direct share of that irradiance, one value or one a band")
+    sky_specular: bool = Field(False, description="take the specular part of an even sky's light away too")
+    weigh_by_confidence: bool = Field(
+        True, description="take away the part of the lobe that class_confidence says, where it is given"
+    )
+    image_noise: Annotated[Noise | list[Noise], WrapValidator(_noise)] = Field(
+        (0.0, 0.0), description="a, b of the image's 1 sigma a + b R in reflectance factor, or one pair a band"
+    )
+    direct_fraction_sigma: PerBand = Field(0.0, description="1 sigma of direct_fraction")
+    normal_sigma_deg: Annotated[float, Field(ge=0, le=45)] | None = Field(
+        None,
+        description="1 sigma of the surface normals along each of two axes; default: what the surface knows of it",
+    )
+    average_normals: bool = Field(False, description="average the lobe over the scatter of the normals")
+    direction_sigma_deg: Annotated[float, Field(ge=0, le=45)] = Field(
+        0.0, description="1 sigma of the direction to the sensor along each of two axes"
+    )
+    material_covariance: Literal["synthetic", "independent"] = Field(
+        "synthetic",
+        description="of materials with errors but no covariance: as of the paper's fits, or an upper bound",
+    )
 
 
 class MaterialSettings(Section):
-    """[materials.settings.NAME]: any key of [model] and [correction] for one material."""
+    """[materials.settings.NAME]: any key of [model] and [correction] for one material, but those of the image."""
 
     enabled: bool = True
     form: Literal["full", "simplified"] | None = None
     precision: Literal["fast", "exact", "reference"] | None = None
-    method: Literal["subtract"] | None = None
+    method: Method | None = None
+    reference: Reference | None = None
     negligible_reflectance: Annotated[float, Field(ge=0, le=1)] | None = None
     uncorrectable: Literal["best", "keep", "nodata"] | None = None
     uncorrectable_share: Annotated[float, Field(gt=0, le=1)] | None = None
     max_zenith_deg: Annotated[float, Field(gt=0, lt=90)] | None = None
     irradiance_plane: Literal["horizontal", "facet"] | None = None
     direct_fraction: PerBand | None = None
+    direct_fraction_sigma: PerBand | None = None
+    sky_specular: bool | None = None
+    normal_sigma_deg: Annotated[float, Field(ge=0, le=45)] | None = None
+    average_normals: bool | None = None
+    material_covariance: Literal["synthetic", "independent"] | None = None
 
 
 class Run(Section):
@@ -357,6 +409,7 @@ TABLES: dict[str, Any] = {
     "view": VIEWS,
     "surface": SURFACES,
     "truth": Truth,
+    "reference": Reference,
     "settings": MaterialSettings,
 }
 """what stands under a key, wherever that is in the file"""

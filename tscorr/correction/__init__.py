@@ -1,8 +1,9 @@
 """The specular peak taken out of a block of an image: pure arrays in, arrays and flags out."""
 
 from tscorr.correction.corrector import BlockInputs, BlockResult, Corrector, class_rows
+from tscorr.correction.extras import check_ratio
 from tscorr.correction.flags import SINGLE_FLAGS, PixelFlag, SpecularState, specular_state
-from tscorr.correction.rules import NEGLIGIBLE_REFLECTANCE, Rules, Stored
+from tscorr.correction.rules import NEGLIGIBLE_REFLECTANCE, ReferenceDirections, Rules, Stored
 from tscorr.correction.tables import add_tally, new_tally
 
 __all__ = [
@@ -12,10 +13,12 @@ __all__ = [
     "BlockResult",
     "Corrector",
     "PixelFlag",
+    "ReferenceDirections",
     "Rules",
     "SpecularState",
     "Stored",
     "add_tally",
+    "check_ratio",
     "class_rows",
     "new_tally",
     "specular_state",

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tscorr import kernels, reference
+from tscorr.correction.extras import extras_table, is_extra, signed
 from tscorr.correction.flags import PixelFlag
 from tscorr.correction.rules import Stored
 from tscorr.correction.tables import (
@@ -31,6 +32,9 @@ class BlockInputs:
     material : uint8 (rows, cols), the material's place in the `Corrector`, from 1; 0 is none.
     sun, view, normal : unit vectors (3, rows, cols), or (3, 1, 1) where constant; east, north, up.
     shadowed, hidden, unreliable, low_confidence : bool (rows, cols), or None where nowhere true.
+    weight : the part of each pixel that is its material, float32 (rows, cols), or None for all of it.
+    normal_sigma_deg : 1 sigma of the normals along each of two axes, float32 (rows, cols), or (1, 1) where constant;
+             or None for no error.
     """
 
     image: Array
@@ -42,6 +46,8 @@ class BlockInputs:
     hidden: Array | None = None
     unreliable: Array | None = None
     low_confidence: Array | None = None
+    weight: Array | None = None
+    normal_sigma_deg: Array | None = None
 
     def flags(self) -> Array:
         """The bits that are known before the correction: uint16 (rows, cols)."""
@@ -59,12 +65,16 @@ class BlockInputs:
 
 @dataclass(frozen=True, slots=True)
 class BlockResult:
-    """A corrected block: the image that came in, what was removed (or None), flags and sums for the report."""
+    """A corrected block: the image that came in, what was removed (or None), flags and sums for the report.
+
+    sigma : float32 (bands, rows, cols), 1 sigma of the corrected reflectance factor; None where not asked for.
+    """
 
     corrected: Array
     removed: Array | None
     flags: Array
     tally: kernels.Tally
+    sigma: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +87,16 @@ class _Engine:
     """of the Fresnel reflectance, where they stand in for the equations"""
     mine: Array
     """bool (materials,): which rows of the table are its own"""
+    extras: kernels.Extras | None
+    """None: plain subtraction, and nothing of the uncertainty"""
 
 
 class Corrector:
     """Corrects the blocks of one scene: materials in order, their rules, and the meaning of stored values.
 
-    materials : name, parameters for each band, allowed angles; row i + 1 of the tables.
+    materials   : name, parameters for each band, allowed angles; row i + 1 of the tables.
+    uncertainty : say how sure the results are. What is not asked for is neither computed nor compiled.
+    weighted    : the blocks come with weights.
     """
 
     def __init__(
@@ -92,6 +106,8 @@ class Corrector:
         *,
         skip: bool = True,
         tally_stride: int = 1,
+        uncertainty: bool = False,
+        weighted: bool = False,
     ) -> None:
         if len(materials) > 254:
             raise InputError(f"a scene has {len(materials)} materials; allowed are 254")
@@ -101,6 +117,9 @@ class Corrector:
         self.stored = stored
         self.skip = skip
         self.tally_stride = tally_stride
+        self.uncertainty = uncertainty
+        self.removed_type = signed(stored.dtype, materials)
+        self._asked = uncertainty or weighted or any(is_extra(rules) for *_, rules in materials)
         self._pixels = pixel_rules(stored)
         precisions = [computed_precision(parameters, rules) for _, parameters, rules in materials]
         self._engines = [
@@ -108,12 +127,13 @@ class Corrector:
             for precision in sorted(set(precisions)) or ["fast"]
         ]
 
-    @staticmethod
-    def _engine(precision: str, mine: Array, materials: Sequence[Entry], stored: Stored) -> _Engine:
+    def _engine(self, precision: str, mine: Array, materials: Sequence[Entry], stored: Stored) -> _Engine:
         real = np.float32 if precision == "fast" else np.float64
         table = material_table(materials, len(stored.scale), real)
+        extras = extras_table(materials, stored, real) if self._asked else None
+        peak = table.peak if extras is None else table.peak | extras.has_sky
         polynomials = fresnel_polynomials(materials, len(stored.scale)) if precision == "fast" else None
-        return _Engine(precision, table._replace(peak=table.peak & mine), polynomials, mine)
+        return _Engine(precision, table._replace(peak=peak & mine), polynomials, mine, extras)
 
     @property
     def peaks(self) -> Array:
@@ -123,56 +143,80 @@ class Corrector:
     def __call__(self, inputs: BlockInputs, *, first_row: int = 0, want_removed: bool = True) -> BlockResult:
         """The block without its specular part; `inputs.image` is changed in place."""
         bands, *shape = inputs.image.shape
-        removed = np.zeros((bands, *shape) if want_removed else (bands, 0, 0), inputs.image.dtype)
-        tally = new_tally(len(self.names) + 1, bands)
-        flags = inputs.flags()
+        everywhere, nowhere = (bands, *shape), (bands, 0, 0)
+        results = _Results(
+            removed=np.zeros(everywhere if want_removed else nowhere, self.removed_type),
+            sigma=np.empty(everywhere if self.uncertainty else nowhere, np.float32),
+            flags=inputs.flags(),
+            tally=new_tally(len(self.names) + 1, bands),
+        )
         if len(self._engines) == 1:
-            self._run(self._engines[0], inputs, removed, flags, tally, first_row)
+            self._run(self._engines[0], inputs, results, first_row)
         else:
-            self._run_each(inputs, removed, flags, tally, first_row)
-        return BlockResult(inputs.image, removed if want_removed else None, flags, tally)
+            self._run_each(inputs, results, first_row)
+        return BlockResult(
+            corrected=inputs.image,
+            removed=results.removed if want_removed else None,
+            flags=results.flags,
+            tally=results.tally,
+            sigma=results.sigma if self.uncertainty else None,
+        )
 
-    def _run_each(
-        self, inputs: BlockInputs, removed: Array, flags: Array, tally: kernels.Tally, first_row: int
-    ) -> None:
+    def _run_each(self, inputs: BlockInputs, results: "_Results", first_row: int) -> None:
         """Several precisions: each engine sees the others' pixels as if they had no material."""
-        known = flags.copy()
+        known = results.flags.copy()
         for engine in self._engines:
             mine = engine.mine[inputs.material]
-            own = replace(inputs, material=np.where(mine, inputs.material, np.uint8(0)))
-            own_flags = known.copy()
-            self._run(engine, own, removed, own_flags, tally, first_row)
+            own_inputs = replace(inputs, material=np.where(mine, inputs.material, np.uint8(0)))
+            own = replace(results, flags=known.copy(), sigma=results.sigma.copy())
+            self._run(engine, own_inputs, own, first_row)
             take = mine | (inputs.material == 0)
-            flags[take] = own_flags[take]
-        tally.states[0] = 0, 0, 0, np.count_nonzero(inputs.material == 0)
+            results.flags[take] = own.flags[take]
+            if self.uncertainty:
+                results.sigma[:, take] = own.sigma[:, take]
+        results.tally.states[0] = 0, 0, 0, np.count_nonzero(inputs.material == 0)
 
-    def _run(
-        self,
-        engine: _Engine,
-        inputs: BlockInputs,
-        removed: Array,
-        flags: Array,
-        tally: kernels.Tally,
-        first_row: int,
-    ) -> None:
+    def _run(self, engine: _Engine, inputs: BlockInputs, results: "_Results", first_row: int) -> None:
         real = np.float32 if engine.precision == "fast" else np.float64
         block = (
             inputs.image,
-            removed,
-            flags,
+            results.removed,
+            results.flags,
             np.ascontiguousarray(inputs.material),
             np.ascontiguousarray(inputs.sun, np.float64),
             np.ascontiguousarray(inputs.view, np.float64),
             np.ascontiguousarray(inputs.normal, np.float64),
             engine.table,
         )
-        rules = self._pixels[np.dtype(real)]
+        rules, tally = self._pixels[np.dtype(real)], results.tally
         options = np.array([self.skip, first_row, self.tally_stride], dtype=np.int64)
-        if engine.precision == "reference":
-            reference.correct_block(*block, rules, tally, options)
+        extras = None if engine.extras is None else _of_block(engine.extras, inputs, results.sigma)
+        if engine.precision == "reference" or extras is not None:
+            reference.correct_block(*block, rules, tally, options, extras)
         else:
             scratch = kernels.new_scratch(len(inputs.image), real)
             kernels.correct_block(*block, engine.polynomials, rules, tally, scratch, options)
+
+
+@dataclass(frozen=True, slots=True)
+class _Results:
+    """What the engines write into."""
+
+    removed: Array
+    sigma: Array
+    """of no rows where it is not asked for, as is `removed`"""
+    flags: Array
+    tally: kernels.Tally
+
+
+def _of_block(extras: kernels.Extras, inputs: BlockInputs, sigma: Array) -> kernels.Extras:
+    """The extras with the fields of one block."""
+    fields: dict[str, Any] = {"sigma": sigma}
+    if inputs.weight is not None:
+        fields["weight"] = np.ascontiguousarray(inputs.weight, np.float32)
+    if inputs.normal_sigma_deg is not None:
+        fields["scatter"] = np.ascontiguousarray(inputs.normal_sigma_deg, np.float32)
+    return extras._replace(**fields)
 
 
 def class_rows(classes: Array, rows: Mapping[int, int]) -> Array:

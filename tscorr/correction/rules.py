@@ -1,12 +1,23 @@
 """How the peak of a material is taken out, and what the stored values of an image mean."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 NEGLIGIBLE_REFLECTANCE = 5e-5
 """threshold for images of floating point, which have no stored step"""
+
+
+class ReferenceDirections(NamedTuple):
+    """Directions about the surface's own normal that method = "reference" normalises to. [deg]"""
+
+    solar_zenith_deg: float = 45.0
+    view_zenith_deg: float = 0.0
+    relative_azimuth_deg: float = 0.0
+
+
+REFERENCE = ReferenceDirections()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,6 +32,14 @@ class Rules:
     max_zenith_deg: float | None = None
     irradiance_plane: Literal["horizontal", "facet"] = "horizontal"
     direct_fraction: tuple[float, ...] = (1.0,)
+    direct_fraction_sigma: tuple[float, ...] = (0.0,)
+    method: Literal["subtract", "ratio", "reference"] = "subtract"
+    reference: ReferenceDirections = REFERENCE
+    sky_specular: bool = False
+    normal_sigma_deg: float | None = None
+    """None: what the surface knows of its normals"""
+    average_normals: bool = False
+    material_covariance: Literal["synthetic", "independent"] = "synthetic"
     enabled: bool = True
 
 
@@ -33,6 +52,10 @@ class Stored:
     offset: tuple[float, ...]
     nodata: float | None = None
     saturation: tuple[float, ...] | None = None
+    noise: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    """a, b of the image's 1 sigma a + b R in reflectance factor: for all bands, or for each"""
+    direction_sigma_deg: float = 0.0
+    """1 sigma of the direction to the sensor, along each of two axes"""
 
     @property
     def step(self) -> float | None:

@@ -79,7 +79,7 @@ def fresnel_polynomials(materials: Sequence[Entry], bands: int) -> Array:
     """`fresnel_polynomial` of each material and band: float32 (materials + 1, bands, FRESNEL_DEGREE + 3)."""
     polynomials = np.zeros((len(materials) + 1, bands, kernels.FRESNEL_DEGREE + 3), np.float32)
     for row, (surface, parameters, rules) in enumerate(materials, start=1):
-        steepest = _steepest(surface, rules)
+        steepest = steepest_deg(surface, rules)
         for band, (n, k) in enumerate(zip(parameters.n, parameters.k, strict=True)):
             polynomials[row, band] = fresnel_polynomial(n, k, steepest)
     return polynomials
@@ -93,7 +93,7 @@ def _material_row(surface: Material, parameters: BandParameters, rules: Rules, b
         )
     beta = np.broadcast_to(np.array(rules.direct_fraction, dtype=float), bands)
     gain = np.pi * beta * parameters.t1
-    low, steepest = surface.zenith_range_deg[0], _steepest(surface, rules)
+    low, steepest = surface.zenith_range_deg[0], steepest_deg(surface, rules)
     shared = np.zeros(bands, bool)
     for key in ("w", "n", "k"):
         values = getattr(parameters, key)
@@ -120,7 +120,7 @@ def _material_row(surface: Material, parameters: BandParameters, rules: Rules, b
     }
 
 
-def _steepest(surface: Material, rules: Rules) -> float:
+def steepest_deg(surface: Material, rules: Rules) -> float:
     """The largest incidence and exitance that are assessed. [deg]"""
     limit = MAX_ZENITH_DEG[rules.form] if rules.max_zenith_deg is None else rules.max_zenith_deg
     return min(surface.zenith_range_deg[1], limit)

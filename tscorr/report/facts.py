@@ -12,6 +12,7 @@ from tscorr.width import LobeShape, lobe_shapes
 
 if TYPE_CHECKING:
     from tscorr.correction import Rules
+    from tscorr.correction.sigmas import SigmaTally
     from tscorr.kernels import Tally
 
 Array = NDArray[Any]
@@ -65,6 +66,8 @@ class SceneFacts:
     peak_rss_mb: float
     version: str
     """of tscorr"""
+    sigmas: "SigmaTally | None" = None
+    """how sure the corrected values are; None where nobody asked"""
 
     def lobe(self, row: int) -> LobeShape:
         """The lobe that stands for a material in widths and plots: that of the middle band."""

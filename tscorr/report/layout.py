@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from tscorr.report import pictures, plots
+from tscorr.report import certainty, pictures, plots
 from tscorr.report.charts import GREY, INK, PALE, stroke
 from tscorr.report.facts import Array, SceneFacts
 from tscorr.report.markup import counts, document, figure, image, legend, paragraph, section, table, tile
@@ -62,6 +62,7 @@ def page(
         _picture(quicklook),
         _materials(report, facts, drawn),
         _numbers(report, order),
+        certainty.section_of(report),
         _motion(report, facts, drawn),
         _map(azimuthal_width),
         _pixels(report),

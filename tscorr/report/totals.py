@@ -11,6 +11,7 @@ import numpy as np
 
 from tscorr.angles import relative_azimuth, unit_vector
 from tscorr.correction import SINGLE_FLAGS, SpecularState
+from tscorr.report.certainty import certainty
 from tscorr.report.facts import Array, SceneFacts
 from tscorr.report.histograms import INCIDENCE_BIN_DEG, SHARE_BIN, TILT_BIN_DEG, above, quantile
 from tscorr.width import (
@@ -147,6 +148,7 @@ def _material(facts: SceneFacts, row: int, path: Array | None) -> dict[str, Any]
         "sensitivity": _sensitivity(lobe),
         "critical_roof": _critical_roof(facts),
         "level_width_deg": level_width_deg,
+        "uncertainty": certainty(facts, row),
         "level_spot_m": _spot(facts, level_width_deg, float(zenithal_width(lobe, facts.solar_zenith_deg, rules.form))),
         "half_width_minutes": _minutes_to_turn(path, level_width_deg / 2),
     }

@@ -23,7 +23,7 @@ from tscorr.scene.pictures import PICTURE_PX, draw_quicklook
 from tscorr.scene.plan import Scene
 from tscorr.scene.run import Pipeline, Progress, Sums, silent
 from tscorr.scene.styles import flag_style
-from tscorr.scene.truth import residual_glare
+from tscorr.scene.truth import coverage, residual_glare
 from tscorr.sensor import FrameView
 from tscorr.sun import solar_path
 
@@ -115,6 +115,8 @@ def finish(
         report["residual_glare"] = residual
     if scene.bad_names:
         report["bad_bands"] = scene.bad_names
+    if (covered := coverage(scene, folder)) is not None:
+        report["coverage"] = covered
     picture = draw_quicklook(scene, folder) if scene.config.output.quicklook else None
     write_json(report, folder / "report.json")
     widths = _decimated_widths(folder)
@@ -152,7 +154,8 @@ def facts_of(scene: Scene, sums: Sums, wall_s: float) -> SceneFacts:
         tally_stride=scene.tally_stride,
         flag_counts=sums.flag_counts(),
         skipped=sums.skipped,
-        uncertainty_evaluated=False,
+        uncertainty_evaluated="uncertainty" in scene.config.output.products,
+        sigmas=sums.sigmas if "uncertainty" in scene.config.output.products else None,
         solar_zenith_deg=sun.zenith_deg,
         solar_azimuth_deg=sun.azimuth_deg,
         convergence_deg=sun.convergence_deg,

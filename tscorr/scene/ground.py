@@ -106,7 +106,9 @@ class Ground:
             )
         dsm: Surface = FlatSurface(0.0)
         if self._heights is not None:
-            dsm = DsmSurface(self._shared_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level)
+            dsm = DsmSurface(
+                self._shared_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level, noise_m=self._noise_m
+            )
         if isinstance(settings, config.DsmSettings):
             return dsm
         info = self._scene.surface_files[-1]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tscorr import config, publish, rasters
-from tscorr.correction import NEGLIGIBLE_REFLECTANCE, Rules, Stored
+from tscorr.correction import NEGLIGIBLE_REFLECTANCE, ReferenceDirections, Rules, Stored, check_ratio
 from tscorr.errors import ConfigError, InputError, MaterialError, TscorrError
 from tscorr.grid import Grid
 from tscorr.materials import BandParameters, Material, find
@@ -144,7 +144,7 @@ def plan_scene(
     class_map = checks(_class_map, settings, whole, image)
     confidence = checks(_confidence, settings, image)
     checks(_check_truth, settings.truth, image)
-    stored = checks(_stored, settings, image)
+    stored = checks(_stored, settings, whole.correction, image)
     wavelengths = checks(_wavelengths, settings, image)
     seen = checks(view_of, settings.view, image)
     surface_files = checks(_surface_files, settings.surface, image)
@@ -158,6 +158,9 @@ def plan_scene(
         )
         for name in names
     )
+    for surface, _, rules in materials:
+        if rules.method == "ratio" and rules.enabled and surface.has_peak:
+            checks(check_ratio, surface, wavelengths, image.bands)
     ground_level, highest = checks(_heights, settings.surface, surface_files) or (0.0, 0.0)
     checks(seen.view.check, image.grid, highest)
     sun = checks(sun_of, settings.sun, seen, image, ground_level)
@@ -297,7 +300,7 @@ def _per_band(value: float | Sequence[float], image: rasters.RasterInfo, what: s
     return tuple(value)
 
 
-def _stored(settings: config.Scene, image: rasters.RasterInfo) -> Stored:
+def _stored(settings: config.Scene, correction: config.Correction, image: rasters.RasterInfo) -> Stored:
     scale = image.scales if settings.scale is None else _per_band(settings.scale, image, "scale")
     offset = image.offsets if settings.offset is None else _per_band(settings.offset, image, "offset")
     for name, values in (("scale", scale), ("offset", offset)):
@@ -319,7 +322,21 @@ def _stored(settings: config.Scene, image: rasters.RasterInfo) -> Stored:
         offset=tuple(value * to_factor for value in offset),
         nodata=image.nodata if settings.nodata is None else settings.nodata,
         saturation=saturation,
+        noise=_noise(correction, image),
+        direction_sigma_deg=correction.direction_sigma_deg,
     )
+
+
+def _noise(correction: config.Correction, image: rasters.RasterInfo) -> tuple[tuple[float, float], ...]:
+    """a, b of the image's noise for each band."""
+    noise = correction.image_noise
+    pairs = noise if isinstance(noise, list) else [noise] * image.bands
+    if len(pairs) != image.bands:
+        raise ConfigError(
+            f"image_noise has {len(pairs)} pairs; the image {image.path} has {image.bands} bands: allowed are one "
+            f"pair, or one a band"
+        )
+    return tuple(pairs)
 
 
 def rules_of(
@@ -341,6 +358,9 @@ def rules_of(
     fractions = _per_band(values["direct_fraction"], image, "direct_fraction")
     if any(not 0 <= fraction <= 1 for fraction in fractions):
         raise ConfigError(f"direct_fraction = {list(fractions)}; allowed are shares from 0 to 1")
+    fraction_sigma = _per_band(values["direct_fraction_sigma"], image, "direct_fraction_sigma")
+    if any(not 0 <= sigma <= 1 for sigma in fraction_sigma):
+        raise ConfigError(f"direct_fraction_sigma = {list(fraction_sigma)}; allowed are shares from 0 to 1")
     negligible = values["negligible_reflectance"]
     if negligible is None:
         negligible = stored.step / 2 if stored.step is not None else NEGLIGIBLE_REFLECTANCE
@@ -357,6 +377,13 @@ def rules_of(
         max_zenith_deg=values["max_zenith_deg"],
         irradiance_plane=values["irradiance_plane"],
         direct_fraction=fractions,
+        direct_fraction_sigma=fraction_sigma,
+        method=values["method"],
+        reference=ReferenceDirections(**values["reference"]),
+        sky_specular=values["sky_specular"],
+        normal_sigma_deg=values["normal_sigma_deg"],
+        average_normals=values["average_normals"],
+        material_covariance=values["material_covariance"],
         enabled=values["enabled"] and (not only or name in only),
     )
 

@@ -25,7 +25,9 @@ from tscorr.correction import (
     class_rows,
     new_tally,
 )
+from tscorr.correction.covariance import ORIGINS, origin
 from tscorr.correction.edges import ShadowByBrightness
+from tscorr.correction.sigmas import SigmaTally
 from tscorr.grid import Block, blocks, north_of
 from tscorr.quicklook import flag_palette
 from tscorr.scene.bad_bands import BadBands
@@ -75,6 +77,7 @@ class Sums:
     def __init__(self, materials: int, bands: int) -> None:
         self.tally = new_tally(materials + 1, bands)
         self.flags = np.zeros(1 << 16, np.int64)
+        self.sigmas = SigmaTally(materials + 1)
         self.skipped = dict.fromkeys(
             ("blocks", "blocks_no_specular_material", "blocks_out_of_reach", "blocks_shadow_or_nodata"), 0
         )
@@ -83,14 +86,16 @@ class Sums:
         """of other processes that worked on the scene"""
         self._lock = threading.Lock()
 
-    def add(self, result: BlockResult, kind: str | None) -> None:
-        """Add a block; `kind` says why most of its work was skipped, if it was."""
+    def add(self, result: BlockResult, rows: Array, kind: str | None) -> None:
+        """Add a block of these rows of the corrector; `kind` says why most of its work was skipped, if it was."""
         from tscorr.scene.compiled import counts_of
 
         counts = counts_of(result.flags)
         with self._lock:
             add_tally(self.tally, result.tally)
             self.flags += counts
+            if result.sigma is not None:
+                self.sigmas.add(result.sigma, result.flags, rows)
             self.skipped["blocks"] += 1
             if kind is not None:
                 self.skipped[kind] += 1
@@ -160,13 +165,19 @@ class Pipeline:
         self.folder = folder
         self._strip = strip
         self._masks = masks
+        self._products = set(scene.config.output.products)
+        self._weighted = scene.confidence is not None and scene.config.correction.weigh_by_confidence
         self.corrector = Corrector(
-            scene.materials, scene.stored, skip=scene.config.run.skip, tally_stride=scene.tally_stride
+            scene.materials,
+            scene.stored,
+            skip=scene.config.run.skip,
+            tally_stride=scene.tally_stride,
+            uncertainty="uncertainty" in self._products,
+            weighted=self._weighted,
         )
         self.bad_bands = BadBands(scene.image.bad_bands)
         self._by_brightness = ShadowByBrightness.of(scene.materials, scene.stored, scene.wavelengths_um)
         self.sums = Sums(len(scene.materials), scene.image.bands)
-        self._products = set(scene.config.output.products)
         self._north = north_of(scene.grid)
         self._tables = [
             width_table(shapes[len(shapes) // 2], rules.form) if peak else None
@@ -226,10 +237,14 @@ class Pipeline:
         layers |= {"corrected": result.corrected, "flags": result.flags[None]}
         if result.removed is not None:
             layers["removed"] = result.removed
+        if result.sigma is not None:
+            layers["uncertainty"] = result.sigma
+            if self.scene.image.bad_bands:
+                result.sigma[np.array(self.scene.image.bad_bands)] = np.nan
         with self.sums.timed("write"):
             for name, writer in self.writers.items():
                 writer.write(block if self._strip is None else block.below(-self._strip.row), layers[name])
-        self.sums.add(result, skipped)
+        self.sums.add(result, rows, skipped)
         return rows.size
 
     def inputs(self, block: Block, image: Array, rows: Array, needed: Array) -> tuple[BlockInputs, Array | None]:
@@ -237,7 +252,9 @@ class Pipeline:
 
         And where no sensor is known to have looked: bool (rows, cols), or None where that is nowhere.
         """
-        scene, doubtful = self.scene, self._doubtful(block)
+        scene = self.scene
+        confidence = self._class_confidence(block)
+        doubtful = None if confidence is None else ~(confidence >= LEAST_CONFIDENCE)
         if not needed.any() and "angles" not in self._products:
             up = np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1)
             inputs = BlockInputs(image=image, material=rows, sun=up, view=up, normal=up, low_confidence=doubtful)
@@ -256,16 +273,23 @@ class Pipeline:
             hidden=unseen if hidden is None else hidden if unseen is None else hidden | unseen,
             unreliable=unreliable,
             low_confidence=doubtful,
+            weight=_weight(confidence) if self._weighted and confidence is not None else None,
+            normal_sigma_deg=self.ground.surface.normal_sigma_deg(block) if self._scatters else None,
         )
         return inputs, unseen
 
-    def _doubtful(self, block: Block) -> Array | None:
-        """Where the class is not known to be more likely right than wrong, or None where nobody says."""
+    @property
+    def _scatters(self) -> bool:
+        """Whether anybody asks for the errors of the normals."""
+        return self.corrector.uncertainty or any(rules.average_normals for *_, rules in self.scene.materials)
+
+    def _class_confidence(self, block: Block) -> Array | None:
+        """How sure the class is, nan where that is not known, or None where nobody says."""
         if self._confidence is None:
             return None
         info = self._confidence.info
-        confidence = self._confidence.read(block, 1) * info.scales[0] + info.offsets[0]
-        return ~(confidence >= LEAST_CONFIDENCE)
+        confidence: Array = self._confidence.read(block, 1) * info.scales[0] + info.offsets[0]
+        return confidence
 
     def _shadowed(
         self, block: Block, image: Array, rows: Array, needed: Array, sun: Array, normal: Array
@@ -327,9 +351,23 @@ class Pipeline:
         angles = rasters.Layer(
             names=ANGLE_NAMES, dtype="float32", nodata=float("nan"), units=("degree",) * 9, tags=tags
         )
+        origins = "; ".join(
+            f"{surface.name}: {ORIGINS[origin(surface, rules.material_covariance)]}"
+            for surface, _, rules in self.scene.materials
+            if surface.has_peak
+        )
         layers = {
             "corrected": like_image,
-            "removed": replace(like_image, nodata=None, offsets=(0.0,) * image.bands),
+            "removed": replace(
+                like_image, dtype=self.corrector.removed_type.name, nodata=None, offsets=(0.0,) * image.bands
+            ),
+            "uncertainty": replace(
+                like_image,
+                dtype="float32",
+                nodata=float("nan"),
+                scales=None,
+                tags={**tags, "QUANTITY": "1 sigma of the corrected reflectance factor", "TSCORR_COVARIANCE": origins},
+            ),
             "flags": rasters.Layer(
                 names=("flags",), dtype="uint16", tags={**tags, **FLAG_TAGS}, palette=flag_palette()
             ),
@@ -342,6 +380,11 @@ class Pipeline:
         if self.scene.config.output.format == "envi":
             return rasters.EnviWriter(self.folder / f"{name}{rasters.ENVI_SUFFIX}", like, layers[name])
         return rasters.Writer(self.folder / f"{name}.tif", profile, like, layers[name])
+
+
+def _weight(confidence: Array) -> Array:
+    """The part of a pixel that is its material: as sure as its class is; all of it where that is not known."""
+    return np.where(np.isnan(confidence), 1, np.clip(confidence, 0, 1)).astype(np.float32)
 
 
 FASTER_CODEC: dict[str, dict[str, Any]] = {"none": {"compress": "zstd"}, "deflate": {"zlevel": 1}}

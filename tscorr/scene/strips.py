@@ -159,6 +159,7 @@ def plain_sums(sums: Sums) -> dict[str, Any]:
     return {
         "tally": {name: values.tolist() for name, values in sums.tally._asdict().items()},
         "flags": {str(flags): int(sums.flags[flags]) for flags in used},
+        "sigmas": {name: values.tolist() for name, values in sums.sigmas.arrays.items()},
         "skipped": sums.skipped,
         "seconds": sums.seconds,
         "peak_rss_mb": peak_rss_mb(),
@@ -170,6 +171,8 @@ def add_sums(total: Sums, part: Mapping[str, Any]) -> None:
     empty = new_tally(len(total.tally.states), total.tally.removed.shape[1])
     tally = {name: np.array(part["tally"][name], values.dtype) for name, values in empty._asdict().items()}
     add_tally(total.tally, empty._replace(**tally))
+    for name, sums in total.sigmas.arrays.items():
+        np.add(sums, np.array(part["sigmas"][name], sums.dtype), out=sums)
     for flags, pixels in part["flags"].items():
         total.flags[int(flags)] += pixels
     for counts, more in ((total.skipped, part["skipped"]), (total.seconds, part["seconds"])):

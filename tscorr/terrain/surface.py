@@ -1,5 +1,6 @@
 """The surface under the pixels: heights and normals of any block of a scene."""
 
+import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -29,6 +30,9 @@ class Surface(Protocol):
     def normals(self, block: Block) -> tuple[Array, Array | None]:
         """Unit normals (3, rows, cols) or (3, 1, 1), east, north, up, and where they cannot be trusted."""
 
+    def normal_sigma_deg(self, block: Block) -> Array:
+        """1 sigma of the normals along each of two axes (rows, cols), or (1, 1) where constant; 0: not known. [deg]"""
+
 
 class FlatSurface:
     """A horizontal surface at one height."""
@@ -46,18 +50,25 @@ class FlatSurface:
         del block
         return np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1), None
 
+    def normal_sigma_deg(self, block: Block) -> Array:
+        """Not known. [deg]"""
+        del block
+        return np.zeros((1, 1), np.float32)
+
 
 class DsmSurface:
     """The surface of a DSM, with normals by Horn's 3 x 3 weights.
 
     read     : heights of a block, nan where void.
     level_m  : height that stands in for a void where the sensor's direction is computed.
+    noise_m  : 1 sigma of the uncorrelated noise of the heights.
     """
 
-    def __init__(self, read: Read, *, cell_x_m: float, cell_y_m: float, level_m: float) -> None:
+    def __init__(self, read: Read, *, cell_x_m: float, cell_y_m: float, level_m: float, noise_m: float = 0.0) -> None:
         self._read = read
         self._cell = {"cell_x_m": cell_x_m, "cell_y_m": cell_y_m}
         self._level_m = level_m
+        self._noise_m = noise_m
 
     def heights(self, block: Block) -> Array:
         """Heights (rows, cols). [m]"""
@@ -69,6 +80,16 @@ class DsmSurface:
         result = horn_normals(self._read(block.padded(halo)), **self._cell)
         inner = (slice(halo, -halo), slice(halo, -halo))
         return result.normals[:, *inner], result.unreliable[inner]
+
+    def normal_sigma_deg(self, block: Block) -> Array:
+        """From the noise of the heights, (rows, cols). [deg]
+
+        Each slope is sum(weight height) / 8 cells with Horn's weights +-(1, 2, 1): its error is sqrt(12) / 8 of the
+        noise a cell. It turns the normal by cos^2 of the tilt downhill and by cos across; the rms of both.
+        """
+        slope = self._noise_m * math.sqrt(12.0) / 8.0 / min(self._cell.values())
+        up = self.normals(block)[0][2]
+        return np.rad2deg(slope * np.sqrt((up**4 + up**2) / 2)).astype(np.float32)
 
 
 class RoofPlaneSurface:
@@ -107,14 +128,18 @@ class RoofPlaneSurface:
         unreliable = np.empty(block.shape, np.bool_)
         for tile in _tiles_under(block):
             planes = self._planes(tile)
-            top, left = max(tile.row, block.row), max(tile.col, block.col)
-            bottom = min(tile.row + tile.height, block.row + block.height)
-            right = min(tile.col + tile.width, block.col + block.width)
-            here = (slice(top - block.row, bottom - block.row), slice(left - block.col, right - block.col))
-            there = (slice(top - tile.row, bottom - tile.row), slice(left - tile.col, right - tile.col))
+            here, there = _common(block, tile), _common(tile, block)
             normals[:, *here] = planes.normals[:, *there]
             unreliable[here] = planes.unreliable[there]
         return normals, unreliable
+
+    def normal_sigma_deg(self, block: Block) -> Array:
+        """From the noise of the heights and the size of the face, (rows, cols). [deg]"""
+        sigma = np.empty(block.shape, np.float32)
+        for tile in _tiles_under(block):
+            here, there = _common(block, tile), _common(tile, block)
+            sigma[here] = self._planes(tile).sigma_deg[there]
+        return sigma
 
     def _planes(self, tile: Block) -> RoofPlanes:
         key = tile.row, tile.col
@@ -156,10 +181,23 @@ class GivenNormals:
         vectors = np.where(missing, np.array([0.0, 0.0, 1.0])[:, None, None], vectors)
         return vectors / np.where(missing, 1.0, length), missing
 
+    def normal_sigma_deg(self, block: Block) -> Array:
+        """Not known. [deg]"""
+        del block
+        return np.zeros((1, 1), np.float32)
+
 
 def _filled(heights: Array, level_m: float) -> Array:
     void = np.isnan(heights)
     return np.where(void, np.float32(level_m), heights) if void.any() else heights
+
+
+def _common(block: Block, other: Block) -> tuple[slice, slice]:
+    """The part of a block that another one covers, as slices of the block."""
+    top, left = max(other.row, block.row), max(other.col, block.col)
+    bottom = min(other.row + other.height, block.row + block.height)
+    right = min(other.col + other.width, block.col + block.width)
+    return slice(top - block.row, bottom - block.row), slice(left - block.col, right - block.col)
 
 
 def _tiles_under(block: Block) -> list[Block]:

@@ -174,152 +174,86 @@ def brdf_gradient(
     return Gradient(t0=np.ones_like(f_spec), t1=f_spec, w=by_w, n=relative * by_n, k=relative * by_k)
 
 
-def correct_block(
-    image: Array,
-    removed: Array,
-    flags: Array,
-    material: Array,
-    sun: Array,
-    view: Array,
-    normal: Array,
-    table: Any,
-    rules: Any,
-    tally: Any,
-    options: Array,
-) -> None:
-    """Take the specular part out of a block of an image, in place; slow, as the equations stand, in float64.
+class DirectionVariance(NamedTuple):
+    """Relative variance of the lobe from unsure directions: w^4 of_w4 + w^2 of_w2 + of_1, with w in 1/rad."""
 
-    Arguments as in kernels.correct_block. `skip` of the options means nothing here.
+    of_w4: Array
+    of_w2: Array
+    of_1: Array
+
+    def at(self, w: Array) -> Array:
+        """The variance for a lobe of this w [1/degree]. [1]"""
+        w2 = np.rad2deg(w) ** 2
+        return np.maximum(0, (self.of_w4 * w2 + self.of_w2) * w2 + self.of_1)
+
+
+def direction_variance(
+    geometry: Geometry, normal_sigma: Array, view_sigma: Array, *, simplified: bool = False, horizontal: bool = True
+) -> DirectionVariance:
+    """Variance of ln(c f_spec), c = cos_i / cos_sun on the `horizontal` plane or 1, from unsure normal and view.
+
+    normal_sigma, view_sigma : 1 sigma along each of two axes across the direction. [rad]
+
+    ln(c f_spec) = -w^2 alpha^2 + ln F + ln shape(cos_i, cos_r). With a, b the derivatives of ln shape by cos_i and
+    cos_r, d = cos alpha, and the gradients of alpha, cos_i, cos_r by the normal (unit length; sin_i; sin_r long),
+
+        |grad|^2 = 4 w^4 alpha^2 + 4 w^2 alpha / sin alpha (a (cos_l - d cos_i) + b (cos_l - d cos_r))
+                   + a^2 sin_i^2 + b^2 sin_r^2 + 2 a b (2 cos_l^2 - 1 - cos_i cos_r)
+
+    and likewise by the view, which turns the half vector by half its own error. 4 w^4 sigma^2 is added to
+    4 w^4 alpha^2, so that the exponential's part is right for errors of any size, and at the top of the lobe, where
+    the first order vanishes. F and cos_l, which change slowly with the view, are left out there.
     """
-    from tscorr import kernels as bits  # flag values; numba is not imported before it is needed
-
-    stored = image.astype(np.float64)
-    missing = ~np.isfinite(stored).all(axis=0)
-    if rules.has_nodata:
-        missing |= (image == rules.nodata[0]).any(axis=0)
-    full = stored >= rules.saturation[:, None, None]
-
-    flags &= np.where(missing | ~table.peak[material], bits.QUALITY, bits.ON_ENTRY)
-    flags[missing] |= bits.NODATA | bits.NOT_ASSESSED
-    flags[~missing & (material == 0)] |= bits.NO_MATERIAL | bits.NOT_ASSESSED
-    flags[~missing & full.any(axis=0)] |= bits.SATURATED
-
-    _, first_row, stride = options
-    for q in range(table.peak.size):
-        where = np.nonzero((material == q) & ~missing)
-        tally.states[q, 3] += np.count_nonzero((material == q) & missing)
-        if not table.peak[q]:
-            tally.states[q, 0 if q else 3] += where[0].size
-            continue
-        all_bands: Any = (slice(None), *where)
-        vectors = [np.broadcast_to(v, (3, *material.shape))[all_bands].astype(float) for v in (sun, view, normal)]
-        angles = geometry(*vectors)
-        f = flags[where]
-        blocked = _not_assessable(angles, f, table, q, bits)
-        amount = np.where(blocked, 0, _specular_reflectance(angles, vectors[0][2], table, q, bits))
-        amount[~(amount >= table.negligible[q])] = 0
-
-        values, saturated = stored[all_bands], full[all_bands]
-        share = _share(amount, values * rules.scale[:, None] + rules.offset[:, None])
-        hit = (amount > 0).any(axis=0)
-        over = hit & (saturated.any(axis=0) | (share > table.share[q]))
-        f[hit & ~over] |= bits.CORRECTED
-        f[over] |= bits.UNCORRECTABLE
-
-        take = (amount > 0) & ~saturated & (~over | (not table.ways[q] & (bits.KEEP | bits.BLANK)))
-        new, clipped = _subtract(values, amount, rules)
-        f[(take & clipped).any(axis=0)] |= bits.CLIPPED
-        new = np.where(take, new, values).astype(image.dtype)
-        image[all_bands] = new
-        if removed.shape[1]:
-            removed[all_bands] = values - new
-        if table.ways[q] & bits.BLANK:
-            image[:, where[0][over], where[1][over]] = rules.nodata[0]
-        flags[where] = f
-
-        tally.states[q] += np.bincount((f >> 6) & 3, minlength=4)
-        tallied = (first_row + where[0]) % stride == 0
-        taken = (values - new) * rules.scale[:, None]
-        _tally(
-            tally,
-            q,
-            angles,
-            np.logical_not(blocked),
-            np.asarray(hit),
-            tallied,
-            share,
-            taken,
-            bool(table.ways[q] & bits.SIMPLIFIED),
-        )
-
-
-def _not_assessable(angles: Geometry, flags: Array, table: Any, q: int, bits: Any) -> Array:
-    """Which pixels are not lit, not seen, too steep or hidden; the reasons are set in `flags`."""
-    self_shadow, behind = ~(angles.cos_i > 0), ~(angles.cos_r > 0)
-    least, most = np.minimum(angles.cos_i, angles.cos_r), np.maximum(angles.cos_i, angles.cos_r)
-    grazing = ~((least >= table.cos_min[q]) & (most <= table.cos_max[q])) & ~self_shadow & ~behind
-    blocked = self_shadow | behind | grazing | (flags & bits.HIDDEN != 0)
-    flags[self_shadow] |= bits.SELF_SHADOW
-    flags[behind] |= bits.NOT_VIEWED
-    flags[grazing] |= bits.GRAZING
-    flags[blocked] |= bits.NOT_ASSESSED
-    return blocked
-
-
-def _specular_reflectance(angles: Geometry, sun_up: Array, table: Any, q: int, bits: Any) -> Array:
-    """B = pi beta c t1 f_spec for each band; c refers it to the horizontal plane. (bands, pixels)"""
-    w, n, k = (getattr(table, name)[q, :, None] for name in ("w", "n", "k"))
-    f_spec = specular(angles, w, n, k, simplified=bool(table.ways[q] & bits.SIMPLIFIED))
-    c = angles.cos_i / sun_up if table.ways[q] & bits.LEVEL else 1.0
-    return table.gain[q, :, None] * c * f_spec
-
-
-def _share(amount: Array, reflectance: Array) -> Array:
-    """The largest share of the signal over the bands; 2 where there is something to take and no signal."""
-    lit = reflectance > 0
-    return np.where(amount > 0, np.where(lit, amount / np.where(lit, reflectance, 1), 2.0), 0).max(axis=0)
-
-
-def _subtract(values: Array, amount: Array, rules: Any) -> tuple[Array, Array]:
-    """Stored values less the amount, rounded to stored steps and held above 0; and where they were held."""
-    steps = amount * rules.steps[:, None]
-    new = values - (np.floor(steps + 0.5) if rules.integer else steps.astype(rules.nodata.dtype))
-    lowest = rules.lowest[:, None]
-    low = new < lowest
-    new = np.where(low, np.minimum(values, lowest), new)
-    dodge = rules.dodge & (new == rules.nodata[0])
-    return np.where(dodge, new + 1, new), low | dodge
-
-
-def _tally(
-    tally: Any,
-    q: int,
-    angles: Geometry,
-    assessed: Array,
-    hit: Array,
-    tallied: Array,
-    share: Array,
-    taken: Array,
-    simplified: bool,
-) -> None:
-    """The sums for the report, as kernels.Tally describes them."""
-    g = attenuation(angles.cos_i, angles.cos_r, angles.cos_l)
-    tally.attenuated[0] += np.count_nonzero((g < 1) & assessed)
-    of = assessed & tallied
-    incidence, tilt = (
-        np.rad2deg(np.arctan2(np.sqrt(1 - angles.cos_i[of] ** 2), angles.cos_i[of])),
-        np.rad2deg(angles.alpha[of]),
+    cos_i, cos_r, cos_l, alpha = geometry
+    by_i, by_r = _shape_slopes(cos_i, cos_r, cos_l, simplified=simplified, horizontal=horizontal)
+    cos_a, sin_a = np.cos(alpha), np.sin(alpha)
+    stretch = np.where(alpha > 0, alpha / np.where(alpha > 0, sin_a, 1), 1)
+    n2, v2 = np.square(normal_sigma), np.square(view_sigma)
+    alpha2, lean = alpha * alpha, (cos_r - cos_i) / 2
+    normal_w2 = 4 * stretch * (by_i * (cos_l - cos_a * cos_i) + by_r * (cos_l - cos_a * cos_r))
+    normal_1 = (
+        by_i**2 * (1 - cos_i**2) + by_r**2 * (1 - cos_r**2) + 2 * by_i * by_r * (2 * cos_l**2 - 1 - cos_i * cos_r)
     )
-    np.add.at(tally.incidence[q], np.minimum(359, incidence * 4).astype(int), 1)
-    np.add.at(tally.tilt[q], np.minimum(899, tilt * 10).astype(int), 1)
-    tally.extremes[q, 0] = min(tally.extremes[q, 0], tilt.min(initial=np.inf))
-    of = hit & tallied
-    part = np.minimum(1, share[of])
-    np.add.at(tally.share[q], (part * 200).astype(int), 1)
-    tally.extremes[q, 1] = max(tally.extremes[q, 1], part.max(initial=0))
-    tally.removed[q] += np.floor(taken[:, of] * 2.0**32 + 0.5).astype(np.int64).sum(axis=1)
-    change = 1 - g[of] if simplified else 1 / g[of] - 1
-    tally.attenuated[1] = max(tally.attenuated[1], (part * change).max(initial=0))
+    view_w4 = (alpha2 - (stretch * lean) ** 2) / cos_l**2
+    view_w2 = 2 * by_r * (alpha * sin_a - stretch * cos_r * lean) / cos_l
+    return DirectionVariance(
+        of_w4=n2 * 4 * (alpha2 + n2) + v2 * view_w4,
+        of_w2=n2 * normal_w2 + v2 * view_w2,
+        of_1=n2 * normal_1 + v2 * by_r**2 * (1 - cos_r**2),
+    )
+
+
+def _shape_slopes(
+    cos_i: Array, cos_r: Array, cos_l: Array, *, simplified: bool, horizontal: bool
+) -> tuple[Array, Array]:
+    """Derivatives of ln(G / (cos_i cos_r)), on the horizontal plane of ln(G / cos_r), by cos_i and by cos_r."""
+    total = cos_i + cos_r
+    whole = simplified | (np.minimum(cos_i, cos_r) * total >= cos_l**2)
+    by_i = np.where(whole, -1 / cos_i, 1 / total - np.where(cos_i > cos_r, 1 / cos_i, 0))
+    by_r = np.where(whole, -1 / cos_r, 1 / total - np.where(cos_i > cos_r, 0, 1 / cos_r))
+    return (by_i + 1 / cos_i if horizontal else by_i), by_r
+
+
+def log_gradient(geometry: Geometry, t1: Array, w: Array, n: Array, k: Array) -> Array:
+    """Derivatives of ln(t1 f_spec) by t0, t1, w, n, k: (5, ...). It does not depend on G."""
+    by_n, by_k = fresnel_gradient(geometry.cos_l, n, k)
+    f = fresnel(geometry.cos_l, n, k)
+    by_w = -2 * w * np.rad2deg(geometry.alpha) ** 2
+    return np.stack(np.broadcast_arrays(np.zeros_like(by_w), 1 / t1, by_w, by_n / f, by_k / f))
+
+
+def broadened(w: Array, normal_sigma_deg: Array) -> tuple[Array, Array]:
+    """The lobe averaged over a Gaussian scatter of normals, sigma along each of two axes: its w, and a factor.
+
+    In the small-angle limit alpha is the length of a vector a in the plane, and the scatter adds a vector e of density
+    exp(-e^2 / 2 sigma^2) / (2 pi sigma^2). Completing the square in each of the two dimensions,
+
+        E exp(-w^2 |a + e|^2) = (w_eff / w)^2 exp(-w_eff^2 |a|^2),   1 / w_eff^2 = 1 / w^2 + 2 sigma^2
+
+    The volume under the lobe is kept: what is taken off the top appears on its sides. All in degrees.
+    """
+    factor = 1 / (1 + 2 * np.square(w * normal_sigma_deg))
+    return w * np.sqrt(factor), factor
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -1,0 +1,60 @@
+"""What the uncertainty costs: `python tests/benchmarks/uncertainty.py`; its time over that of the kernel without it.
+
+Processor time of one thread, rounds that alternate, so that ratios hold on a busy machine too. A block of a city of
+five materials in memory, whose roofs are 32 pixels wide, corrected as a run corrects it; without the histograms of
+the report, which large scenes take of few rows. "city": every pixel is assessed; "a quarter": a quarter of the roofs.
+"""
+
+import statistics
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from tscorr.bench.scene import ROOF, City
+from tscorr.correction import BlockInputs, Corrector, Rules, Stored
+
+NO_TALLY = 10**9
+SIDE, ROUNDS = 512, 15
+
+
+def inputs_of(city: City, stored: Stored, rng: np.random.Generator, share: float) -> BlockInputs:
+    """A block of the city of which a share has a material, and normals with an error of their own."""
+    block = city.block(stored, rng)
+    kept = rng.random((-(-SIDE // ROOF),) * 2) < share
+    mask = kept.repeat(ROOF, axis=0).repeat(ROOF, axis=1)[:SIDE, :SIDE]
+    sigma = rng.uniform(0.05, 0.5, mask.shape).astype(np.float32)
+    return replace(block, material=block.material * mask, normal_sigma_deg=sigma)
+
+
+def seconds(corrector: Corrector, inputs: BlockInputs) -> float:
+    """Processor time of one block."""
+    fresh = replace(inputs, image=inputs.image.copy())
+    start = time.thread_time()
+    corrector(fresh)
+    return time.thread_time() - start
+
+
+def main() -> None:
+    """Print a line for each kind of block."""
+    city, rng = City.build((SIDE, SIDE)), np.random.default_rng(1)
+    for bands in (4, 12):
+        stored = Stored(
+            dtype=np.dtype(np.uint16), scale=(1e-4,) * bands, offset=(0.0,) * bands, noise=((0.0005, 0.003),)
+        )
+        rules = Rules(direct_fraction=(0.9,), direct_fraction_sigma=(0.02,))
+        entries = [(surface, surface.at(bands=bands), rules) for surface in city.materials]
+        plain, asked = (
+            Corrector(entries, stored, tally_stride=NO_TALLY, uncertainty=uncertainty) for uncertainty in (False, True)
+        )
+        for name, share in (("city", 1.0), ("a quarter", 0.25)):
+            inputs = inputs_of(city, stored, rng, share)
+            rounds = [(seconds(plain, inputs), seconds(asked, inputs)) for _ in range(ROUNDS + 1)][1:]
+            without, asked_for = (1e9 * statistics.median(column) / SIDE**2 for column in zip(*rounds, strict=True))
+            ratio = statistics.median(b / a for a, b in rounds)
+            line = f"{bands:2d} bands, {name:9s}  {without:6.1f} ns  {asked_for:6.1f} ns a pixel  ratio {ratio:.2f}"
+            print(line)  # noqa: T201 - a script
+
+
+if __name__ == "__main__":
+    main()
