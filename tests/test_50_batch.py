@@ -2,21 +2,26 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from small_scene import (
     SHAPE,
     TILE,
     small_scene,
     write_config,
+    write_image,
     write_inputs,
+    write_raster,
     write_truncated_image,
 )
 
-from tscorr import batch
+from tscorr import batch, publish
 from tscorr.config import load_config
-from tscorr.errors import ConfigError, InputError, MaterialError
+from tscorr.errors import ConfigError, InputError, MaterialError, TscorrError
 
 LIBRARY = """
 [tiles]
@@ -210,3 +215,90 @@ def test_a_batch_of_many_scenes_keeps_no_file_open(tmp_path):
     before = len(list(OPEN_FILES.iterdir()))
     batch.run(config)
     assert len(list(OPEN_FILES.iterdir())) == before
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_flipped_bytes_of_an_image_leave_the_old_result_or_make_a_whole_new_one(with_a_result, seed):
+    config, target = with_a_result
+    rng = np.random.default_rng(seed)
+    content = bytearray((config.parent / "image.tif").read_bytes())
+    for place in rng.integers(0, len(content), 4):
+        content[place] ^= 1 << rng.integers(8)
+    (config.parent / "image.tif").write_bytes(content)
+    assert_old_or_whole(config, target)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.01, 0.3, 0.6, 0.9, 0.999])
+def test_an_image_cut_short_leaves_the_old_result(with_a_result, kept):
+    config, target = with_a_result
+    content = (config.parent / "image.tif").read_bytes()
+    (config.parent / "image.tif").write_bytes(content[: int(kept * len(content))])
+    assert_old_or_whole(config, target)
+
+
+@pytest.fixture
+def with_a_result(tmp_path):
+    """A configuration whose scene is published, and that result's folder."""
+    config = small_scene(tmp_path)
+    assert states(config) == {"roofs": "done"}
+    return config, tmp_path / "out" / "roofs"
+
+
+def assert_old_or_whole(config, target):
+    """Run on a damaged input: refused, failed, or done; the result is whole whatever comes."""
+    before = (target / "manifest.json").read_bytes()
+    try:
+        done = states(config) == {"roofs": "done"}
+    except TscorrError:
+        done = False
+    assert publish.damaged(target) == []
+    assert ((target / "manifest.json").read_bytes() == before) == (not done)
+    assert hidden(config.parent) == []
+
+
+BUSY = """
+import sys, threading, time
+from pathlib import Path
+from tscorr import batch, publish
+
+def states():
+    for task in Path("/proc/self/task").iterdir():
+        try:
+            name, rest = (task / "stat").read_text().rsplit(")", 1)
+            yield int(task.name), rest.split()[0], sum(map(int, rest.split()[11:13]))
+        except OSError:
+            pass
+
+def ticks():
+    return {task: used for task, _, used in states()}
+
+batch.run(sys.argv[1], workers=int(sys.argv[2]))  # compiled and loaded
+mine, before = threading.get_native_id(), ticks()
+most = 0
+ended = threading.Event()
+
+def watch():
+    global most
+    me = threading.get_native_id()
+    while not ended.wait(0.002):
+        most = max(most, sum(state == "R" for task, state, _ in states() if task not in (me, mine)))
+
+watcher = threading.Thread(target=watch)
+watcher.start()
+batch.run(sys.argv[1], workers=int(sys.argv[2]), overwrite=True)
+ended.set()
+watcher.join()
+print(most)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are counted in /proc")
+@pytest.mark.parametrize("workers", [1, 2])
+def test_no_more_threads_are_busy_than_there_are_workers(tmp_path, workers):
+    write_image(tmp_path / "image.tif", np.full((3, 1024, 1024), 4000, np.int16), blockxsize=64, blockysize=64)
+    write_raster(tmp_path / "class_map.tif", np.full((1024, 1024), TILE, np.uint8))
+    write_raster(tmp_path / "dsm.tif", np.ones((1024, 1024), np.float32))
+    config = write_config(tmp_path, run={"memory_limit_mb": 230})
+    command = [sys.executable, "-c", BUSY, config, str(workers)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert int(result.stdout) <= workers + 1  # one hashes the inputs beside the work

@@ -13,6 +13,8 @@ from tscorr.scene.run import BASE_MB, pixel_bytes, units_of, work_bytes, workers
 PRODUCT_BYTES = {"flags": 2, "azimuthal_width": 4, "angles": 36}
 OVERVIEWS = 4 / 3
 """size of a raster with its overviews, over that without"""
+BESIDE_BYTES = 3e6
+"""report, picture and colour table"""
 
 
 def forecast(scene: Scene) -> dict[str, Any]:
@@ -52,7 +54,7 @@ def forecast(scene: Scene) -> dict[str, Any]:
 
 
 def disk_bytes(scene: Scene) -> tuple[float, float]:
-    """Least and most that the rasters of a scene's result take on the disk, while they are written.
+    """Least and most that a scene's result takes on the disk, while it is written.
 
     Least: the corrected image alone, as small as the image is where it keeps its codec. Most: nothing compresses.
     """
@@ -61,6 +63,7 @@ def disk_bytes(scene: Scene) -> tuple[float, float]:
     image_bytes = pixels * pixel_bytes(image)
     each = [pixels * PRODUCT_BYTES[p] if p in PRODUCT_BYTES else image_bytes for p in output.products]
     most = sum(each) * OVERVIEWS + max(each, default=0) if output.format == "cog" else sum(each)
+    most += BESIDE_BYTES
     if "corrected" not in output.products:
         return 0.0, most
     codec = output.compression or image.profile["compress"]
