@@ -7,6 +7,7 @@ import inspect
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -212,6 +213,44 @@ def test_correct_block(precision, stored, settings):
         assert np.abs(np.cumsum(found - expected, axis=1)).max() <= 12, key
     np.testing.assert_allclose(ours.tally.removed, truth.tally.removed, rtol=1e-3, atol=2**32 * 1e-3)
     np.testing.assert_allclose(ours.tally.extremes, truth.tally.extremes, atol=3e-3)
+
+
+UNSURE = {"direct_fraction": (0.8,), "direct_fraction_sigma": (0.02,)}
+EXTRAS = {
+    "uncertainty": UNSURE,
+    "sky": {"sky_specular": True, **UNSURE},
+    "average": {"average_normals": True},
+    "ratio": {"method": "ratio", "sky_specular": True, "form": "simplified", **UNSURE},
+    "reference": {"method": "reference", "sky_specular": True, "uncorrectable": "nodata", **UNSURE},
+}
+
+
+@pytest.mark.parametrize("settings", EXTRAS.values(), ids=EXTRAS)
+def test_correct_block_with_extras(settings):
+    """Values and flags as above; sigma to 1 % in 99.9 % of the values: polynomials, and a kink of G."""
+    stored = replace(UINT16, noise=((0.0005, 0.003),), direction_sigma_deg=0.2)
+    results = {}
+    for precision in ("fast", "reference"):
+        rng = np.random.default_rng(5)
+        entries = [(s, s.at([0.55, 0.6, 0.7]), Rules(precision=precision, **settings)) for s in SURFACES]
+        inputs = hard_block(stored)
+        shape = inputs.material.shape
+        weight = np.where(rng.random(shape) < 0.3, rng.random(shape), 1).astype(np.float32)
+        sigma = rng.uniform(0, 2, shape).astype(np.float32)
+        corrector = Corrector(entries, stored, uncertainty=True, weighted=True)
+        results[precision] = corrector(replace(inputs, weight=weight, normal_sigma_deg=sigma))
+    ours, truth = results["fast"], results["reference"]
+    same = ours.flags == truth.flags
+    assert np.mean(~same) < 5e-4
+    difference = np.abs(ours.removed.astype(int) - truth.removed)
+    assert difference[:, same].max() <= 1
+    assert np.mean(difference > 0) < 5e-4
+    np.testing.assert_array_equal(np.isnan(ours.sigma), np.isnan(truth.sigma))
+    compared = np.isfinite(truth.sigma) & same
+    error = np.abs(ours.sigma[compared] / truth.sigma[compared] - 1)
+    assert np.quantile(error, 0.999) < 0.01
+    assert error.max() < 0.15
+    assert np.abs(ours.tally.states - truth.tally.states).max() <= 3
 
 
 SCRIPT = """

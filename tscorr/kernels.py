@@ -24,7 +24,7 @@ CHUNK = 128
 """pixels of a row that are worked on at a time: their scratch arrays stay in the L1 cache"""
 
 ENDLESS = np.float32(math.inf)
-ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+ZERO, HALF, ONE, TWO, FOUR = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2), np.float32(4)
 DEG_PER_RAD = 180 / math.pi
 
 # Bits of PixelFlag, which correction.py documents.
@@ -56,6 +56,9 @@ A6, A7, A8 = np.float32(0.009950104), np.float32(-0.006363017), np.float32(0.002
 # 2^x over [-1/2, 1/2]; largest relative error 2e-9
 E1, E2, E3 = np.float32(0.6931472), np.float32(0.24022646), np.float32(0.05550329)
 E4, E5, E6 = np.float32(0.00961852), np.float32(0.001339986), np.float32(0.00015337576)
+# alpha / sin alpha - 1 over alpha^2
+T1, T2, T3 = np.float32(1 / 6), np.float32(7 / 360), np.float32(31 / 15120)
+T4, T5 = np.float32(127 / 604800), np.float32(73 / 3421440 * 1.25)
 MINUS_LOG2_E = np.float32(-1.4426950408889634)
 TWO_TO_32 = 4294967296.0
 MOST_STEPS = np.float32(2**30)
@@ -65,6 +68,7 @@ BOUND_MARGIN = np.float32(0.999)
 LOWEST_EXPONENT = np.float32(-100)
 """2 to the power of less is taken for 0, so that no product gets denormal, which costs 100 times as much"""
 
+RAD_PER_DEG = np.float32(math.pi / 180)
 DEGREES_PER_RAD, QUARTERS_PER_RAD, TEN = np.float32(180 / math.pi), np.float32(720 / math.pi), np.float32(10)
 LAST_QUARTER, LAST_TENTH = np.float32(359), np.float32(899)
 """the last bins of the histograms"""
@@ -74,10 +78,15 @@ SUN, VIEW, NORMAL = 0, 3 * CHUNK, 6 * CHUNK
 (
     COS_I, COS_R, COS_L, ALPHA2, SUN_UP, COS_MIN, COS_MAX, NEGLIGIBLE, LIMIT, BOUND, SHAPE, W2, EXPONENTIAL, LOBE,
     SHARE, THRESHOLD, TILT,
-) = range(0, 17 * CHUNK, CHUNK)  # fmt: skip
+    WEIGHT, SCATTER2, FACTOR, TURNS_W4, TURNS_W2, TURNS, BY_R, STRETCH, OF_MATERIAL, SPREAD, CROSS, BACK_VARIANCE,
+    SKY, ALBEDO, BACK, BACK_SKY, DIFFUSE, BETA_RATE, BETA_SIGMA, SKY_SIGMA, HOLE,
+) = range(0, 38 * CHUNK, CHUNK)  # fmt: skip
 (
     KIND, MISSING, SATURATES, ASSESS, HIT, OVER, CLIPS, MARKS, STATE, WAYS, TAKE, POWER, INCIDENCE_BIN, TILT_BIN,
-) = range(0, 14 * CHUNK, CHUNK)  # fmt: skip
+    METHOD, AVERAGED, SKIES, UNSURE,
+) = range(0, 18 * CHUNK, CHUNK)  # fmt: skip
+# How a pixel is assessed.
+LIT, SHADED = 1, 2
 
 BLOCK: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
 STEP: dict[str, Any] = {**BLOCK, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -153,6 +162,8 @@ class Scratch(NamedTuple):
     """whole[POWER:] read as float32"""
     amounts: Any
     """(bands, CHUNK): reflectance factor to remove"""
+    direct: Any
+    """(bands, CHUNK): the sun's part of it"""
     present: Any
     """(256,): materials of a chunk"""
 
@@ -301,20 +312,22 @@ def specular(geometry, w, n, k, simplified):
 
 def new_scratch(bands: int, real: type[np.floating[Any]]) -> Scratch:
     """Memory for one thread."""
-    whole = np.zeros(14 * CHUNK, np.int32)
+    whole, lines = np.zeros(18 * CHUNK, np.int32), np.zeros(38 * CHUNK, real)
+    lines[FACTOR : FACTOR + CHUNK] = 1
     return Scratch(
         aims=np.zeros(9 * CHUNK),
-        real=np.zeros(17 * CHUNK, real),
+        real=lines,
         whole=whole,
         power=whole[POWER : POWER + CHUNK].view(np.float32),
         amounts=np.zeros((bands, CHUNK), real),
+        direct=np.zeros((bands, CHUNK), real),
         present=np.zeros(256, np.int64),
     )
 
 
 @njit(**BLOCK)
 def correct_block(
-    image, removed, flags, material, sun, view, normal, table, polynomials, rules, tally, scratch, options
+    image, removed, flags, material, sun, view, normal, table, polynomials, rules, tally, scratch, options, extras=None
 ):
     """Take the specular part out of a block of an image, in place. Twin of reference.correct_block.
 
@@ -329,6 +342,7 @@ def correct_block(
                scale and shift; scale is 0 where the polynomial misses its bound and `fresnel` is to be taken.
                Or None: the equations themselves at each pixel, in float64.
     options  : int64 (3,): skip, first row of the block in the image, tally every so many rows.
+    extras   : Extras; or None: plain subtraction of the sun's part, and nothing more is compiled.
     """
     bands, rows, cols = image.shape
     skip, first_row, stride = options[0] != 0, options[1], options[2]
@@ -355,28 +369,43 @@ def correct_block(
                 _aim(normal, NORMAL, row, start, stop, aims)
                 _set_cosines(aims, real)
                 assessed = _assess(whole, real)
+            plain = True
+            if extras is not None:
+                plain = _set_extras(scratch, extras, peaks, row, start, stop)
+                assessed += 0 if plain else _assess_shaded(whole, real)
 
             # What is to be removed, and what becomes of each pixel.
             inside = assessed > 0
             if inside:
                 tally.attenuated[0] += _set_shape(whole, real)
-                inside = _set_amounts(scratch, table, polynomials, peaks, skip)
+                inside = _set_amounts(scratch, table, polynomials, peaks, skip, extras)
                 tally.out_of_lobe[0] += 0 if inside else assessed
             if inside:
                 _clear(whole, real)
-                for b in range(bands):
-                    _weigh(amounts[b], image[b, row, start:stop], rules.scale[b], rules.offset[b], whole, real)
+                if plain:
+                    for b in range(bands):
+                        _weigh(amounts[b], image[b, row, start:stop], rules.scale[b], rules.offset[b], whole, real)
+                if extras is not None:
+                    for b in range(0 if plain else bands):
+                        _weigh_any(scratch, extras, peaks, image[b, row, start:stop], rules, b)
                 hits = _settle(whole)
+            if extras is not None and extras.sigma.shape[1] > 0:
+                _set_sigma(scratch, table, extras, peaks, hits, plain, image, row, start, stop, rules)
             for b in range(bands if hits > 0 else 0):
                 line = image[b, row, start:stop]
-                if tallied:
+                if tallied and plain:
                     _set_share(amounts[b], line, rules.scale[b], rules.offset[b], real)
-                _subtract(amounts[b], line, rules, b, whole, real)
+                if plain:
+                    _subtract(amounts[b], line, rules, b, whole, real)
+                elif extras is not None:
+                    _exchange(amounts[b], line, rules, b, extras.highest[0], whole, real)
                 if removed.shape[1] > 0:
                     _keep(amounts[b], removed[b, row, start:stop], whole)
             if hits > 0 and _count_blanks(whole) > 0:
                 for b in range(bands):
                     _blank(image[b, row, start:stop], nodata, whole)
+                    if extras is not None and extras.sigma.shape[1] > 0:
+                        _blank(extras.sigma[b, row, start:stop], np.float32(np.nan), whole)
 
             _store(marks, whole)
             for place in range(kinds):
@@ -536,7 +565,7 @@ def _set_shape(whole, real):
     """G / (cos_i cos_r), on the plane that R refers to; finite at grazing angles. The number of pixels with G < 1."""
     attenuated = np.int32(0)
     for j in range(CHUNK):
-        good = whole[ASSESS + j] != 0
+        good = whole[ASSESS + j] == LIT
         cos_i, cos_r, cos_l = real[COS_I + j], real[COS_R + j], real[COS_L + j]
         least = cos_i if cos_i < cos_r else cos_r
         most = cos_r if cos_i < cos_r else cos_i
@@ -555,14 +584,21 @@ def _set_shape(whole, real):
 
 
 @njit(**STEP)
-def _set_amounts(scratch, table, polynomials, peaks, skip):
+def _set_amounts(scratch, table, polynomials, peaks, skip, extras):
     """The reflectance to remove in each band; False, and none of it, if the chunk is out of every lobe.
 
     Bands with the same w, n, k share the lobe. A chunk is out of it where the largest pi beta t1 F times the
     exponential stays below the threshold everywhere, which one exponential tells if all bands have the same w.
     """
-    aims, real, whole, power, amounts, present = scratch
-    may_skip = skip
+    aims, real, whole, power, amounts, _, present = scratch
+    may_skip, scattered, weighted = skip, False, False
+    if extras is not None:
+        weighted = extras.weight.size > 1
+        for place in range(peaks):
+            q = present[place]
+            may_skip &= extras.method[q] != REFERENCE and not extras.has_sky[q]
+            weighted &= extras.method[q] == SUBTRACT and not extras.has_sky[q]
+            scattered |= extras.averaged[q]
     for place in range(peaks):
         may_skip &= table.one_w[present[place]]
     for b in range(len(amounts)):
@@ -571,12 +607,22 @@ def _set_amounts(scratch, table, polynomials, peaks, skip):
             again |= not table.shared[present[place], b]
         if again:
             if polynomials is None:
+                if extras is not None:
+                    _set_factors(scratch, table.w2[:, b], peaks, scattered)
                 _set_lobe_by_equations(whole, real, aims, table.w[:, b], table.n[:, b], table.k[:, b])
+                if weighted:
+                    _scale(real, LOBE, WEIGHT)
             else:
                 for place in range(peaks):
                     q = present[place]
                     _set_w2(whole, real, np.int32(q), table.w2[q, b])
+                if extras is not None:
+                    _set_factors(scratch, table.w2[:, b], peaks, scattered)
                 _set_exponential(whole, real, power)
+                if scattered:
+                    _scale(real, EXPONENTIAL, FACTOR)
+                if weighted:
+                    _scale(real, EXPONENTIAL, WEIGHT)
                 if may_skip and b == 0 and _is_outside(real):
                     return False
                 for place in range(peaks):
@@ -593,13 +639,14 @@ def _set_lobe_by_equations(whole, real, aims, w, n, k):
     """f_spec of all materials of a chunk in one band, on the plane that R refers to."""
     for j in range(CHUNK):
         real[LOBE + j] = ZERO
-        if whole[ASSESS + j] != 0:
+        if whole[ASSESS + j] == LIT:
             q = whole[KIND + j]
+            factor = np.float64(real[FACTOR + j])
             sun = (aims[SUN + j], aims[SUN + CHUNK + j], aims[SUN + 2 * CHUNK + j])
             view = (aims[VIEW + j], aims[VIEW + CHUNK + j], aims[VIEW + 2 * CHUNK + j])
             normal = (aims[NORMAL + j], aims[NORMAL + CHUNK + j], aims[NORMAL + 2 * CHUNK + j])
             angles = geometry(sun, view, normal)
-            f = specular(angles, w[q], n[q], k[q], (whole[WAYS + j] & SIMPLIFIED) != 0)
+            f = factor * specular(angles, w[q] * math.sqrt(factor), n[q], k[q], (whole[WAYS + j] & SIMPLIFIED) != 0)
             real[LOBE + j] = f * angles[0] / sun[2] if (whole[WAYS + j] & LEVEL) != 0 else f
 
 
@@ -729,7 +776,7 @@ def _subtract(amounts, line, rules, b, whole, real):
         new = floor if low else new
         dodge = dodges & (new == blank)
         new = new + ONE if dodge else new
-        take = (amounts[j] > ZERO) & (value < saturation)
+        take = (amounts[j] != ZERO) & (value < saturation)
         take = take & (whole[TAKE + j] != 0)
         whole[CLIPS + j] |= np.int32(take & (low | dodge))
         new = new if take else value
@@ -795,11 +842,11 @@ def _tally_geometry(whole, real, count, tally):
         incidence = np.sqrt(_arccos2(u if u > ZERO else ZERO)) * QUARTERS_PER_RAD
         tilt = np.sqrt(real[ALPHA2 + j]) * DEGREES_PER_RAD
         real[TILT + j] = tilt
-        assess = whole[ASSESS + j] != 0
+        assess = whole[ASSESS + j] == LIT
         whole[INCIDENCE_BIN + j] = np.int32(incidence if assess & (incidence < LAST_QUARTER) else LAST_QUARTER)
         whole[TILT_BIN + j] = np.int32(tilt * TEN if assess & (tilt * TEN < LAST_TENTH) else LAST_TENTH)
     for j in range(count):
-        if whole[ASSESS + j] != 0:
+        if whole[ASSESS + j] == LIT:
             q = whole[KIND + j]
             tally.incidence[q, whole[INCIDENCE_BIN + j]] += 1
             tally.tilt[q, whole[TILT_BIN + j]] += 1
@@ -818,6 +865,365 @@ def _tally_removed(whole, real, amounts, count, scale, tally):
             for b in range(scale.size):
                 taken = np.float64(amounts[b, j]) * np.float64(scale[b])
                 tally.removed[q, b] += np.int64(taken * TWO_TO_32 + 0.5)
+            if whole[ASSESS + j] != LIT:
+                continue
             g = attenuation(np.float64(real[COS_I + j]), np.float64(real[COS_R + j]), np.float64(real[COS_L + j]))
             change = 1 - g if (whole[WAYS + j] & SIMPLIFIED) != 0 else 1 / g - 1
             tally.attenuated[1] = max(tally.attenuated[1], part * change)
+
+
+@njit(**STEP)
+def _set_extras(scratch, extras, peaks, row, start, stop):
+    """What only some runs have of a chunk; True if all its materials are simply subtracted, without the sky."""
+    real, whole, present, plain = scratch.real, scratch.whole, scratch.present, True
+    _set_fields(extras.weight, extras.scatter, row, start, stop, whole, real)
+    for place in range(0 if extras.simple else peaks):
+        q = present[place]
+        method, averaged, has_sky = (
+            np.int32(extras.method[q]),
+            np.int32(extras.averaged[q]),
+            np.int32(extras.has_sky[q]),
+        )
+        _set_more(whole, real, np.int32(q), method, averaged, has_sky, extras.own_scatter[q])
+        plain &= extras.method[q] == SUBTRACT and not extras.has_sky[q]
+    return plain
+
+
+@njit(**STEP)
+def _set_factors(scratch, w2, peaks, scattered):
+    """Broaden the lobes of materials whose scattered normals are averaged."""
+    real, whole, present = scratch.real, scratch.whole, scratch.present
+    for place in range(peaks if scattered else 0):
+        _set_w2(whole, real, np.int32(present[place]), w2[present[place]])
+    if scattered:
+        _set_factor(whole, real)
+        _scale(real, W2, FACTOR)
+
+
+@njit(**STEP)
+def _weigh_any(scratch, extras, peaks, line, rules, b):
+    """`_weigh` for any method, and with the sky's part."""
+    for place in range(peaks):
+        q = scratch.present[place]
+        _set_parts(scratch.whole, scratch.real, scratch.aims, np.int32(q), extras.sky[q, b], extras.parts[q, b])
+    _weigh_parts(
+        scratch.amounts[b], scratch.direct[b], line, rules.scale[b], rules.offset[b], scratch.whole, scratch.real
+    )
+
+
+@njit(**STEP)
+def _set_sigma(scratch, table, extras, peaks, hits, plain, image, row, start, stop, rules):
+    """1 sigma of the corrected values of a chunk, before they are corrected; and flags of those that are unsure."""
+    real, whole, present = scratch.real, scratch.whole, scratch.present
+    scale, offset, saturation = rules.scale, rules.offset, rules.saturation
+    bands = len(image)
+    for b in range(bands if hits == 0 or not plain else 0):
+        line = image[b, row, start:stop]
+        _set_noise(extras.sigma[b, row, start:stop], line, scale[b], offset[b], extras.noise[b], whole)
+    if hits == 0:
+        return
+    _set_holes(whole, real)
+    _set_turns(whole, real)
+    if extras.view_variance[0] > 0:
+        _add_view_turns(whole, real, extras.view_variance[0])
+    for b in range(bands):
+        line, sigma, taken = image[b, row, start:stop], extras.sigma[b, row, start:stop], scratch.amounts[b]
+        for place in range(peaks):
+            q = present[place]
+            if b == 0 or not extras.same_variance[q, b]:
+                _set_spread(whole, real, np.int32(q), table.w2[q, b], extras.variance[q, b])
+            if not plain:
+                _set_parts(whole, real, scratch.aims, np.int32(q), extras.sky[q, b], extras.parts[q, b])
+                _set_cross(whole, real, np.int32(q), extras.cross[q, b], extras.variance[q, b])
+        if plain:
+            _spread(sigma, taken, line, scale[b], offset[b], extras.noise[b], saturation[b], whole, real)
+        else:
+            _spread_parts(sigma, taken, scratch.direct[b], line, scale[b], offset[b], saturation[b], whole, real)
+    _mark_unsure(whole)
+
+
+@njit(**STEP)
+def _set_holes(whole, real):
+    """1 where there is data, else nan."""
+    for j in range(CHUNK):
+        real[HOLE + j] = ONE if whole[MISSING + j] == 0 else real.dtype.type(np.nan)
+
+
+@njit(**STEP)
+def _exchange(amounts, line, rules, b, highest, whole, real):
+    """`_subtract` for amounts of either sign; the new value is held above 0 and in the range of the type."""
+    steps, least, saturation = rules.steps[b], rules.lowest[b], rules.saturation[b]
+    dodges, integer, blank = rules.dodge, rules.integer, real.dtype.type(rules.nodata[0])
+    for j in range(line.size):
+        value = real.dtype.type(line[j])
+        part = amounts[j] * steps
+        if integer is None:
+            part = real.dtype.type(line.dtype.type(part))
+        else:
+            part = np.floor(part + HALF)
+            part = part if part < MOST_STEPS else MOST_STEPS
+        new = value - part
+        low, most = new < least, highest if highest > value else value
+        floor = least if least < value else value
+        new = floor if low else new
+        high = new > most
+        new = most if high else new
+        dodge = dodges & (new == blank)
+        new = new + ONE if dodge else new
+        take = (amounts[j] != ZERO) & (value < saturation) & (whole[TAKE + j] != 0)
+        whole[CLIPS + j] |= np.int32(take & (low | high | dodge))
+        new = new if take else value
+        amounts[j] = value - new
+        line[j] = new
+
+
+@njit(**STEP)
+def _set_noise(sigma, line, scale, offset, noise, whole):
+    """1 sigma of the image in one band; nan where it has no data."""
+    a, b, nothing = np.float32(noise[0]), np.float32(noise[1]), np.float32(np.nan)
+    for j in range(line.size):
+        r = np.float32(line[j]) * np.float32(scale) + np.float32(offset)
+        r = r if r > ZERO else ZERO
+        sigma[j] = nothing if whole[MISSING + j] != 0 else a + b * r
+
+
+@njit(**STEP)
+def _set_fields(weight, scatter, row, start, stop, whole, real):
+    """Weights and the variance of the normals of a chunk, each of which may be one for all pixels; no more rules."""
+    sigma = scatter[0, 0] * RAD_PER_DEG
+    for j in range(CHUNK):
+        real[WEIGHT + j] = weight[0, 0]
+        real[SCATTER2 + j] = sigma * sigma
+        whole[UNSURE + j] = 0
+        whole[AVERAGED + j] = 0
+        whole[SKIES + j] = 0
+    if weight.size > 1:
+        line = weight[row, start:stop]
+        for j in range(line.size):
+            real[WEIGHT + j] = line[j]
+    if scatter.size > 1:
+        line = scatter[row, start:stop]
+        for j in range(line.size):
+            sigma = line[j] * RAD_PER_DEG
+            real[SCATTER2 + j] = sigma * sigma
+
+
+@njit(**STEP)
+def _set_more(whole, real, kind, method, averaged, has_sky, own_scatter):
+    """The rules of one material for its pixels that only some runs have."""
+    own, sigma = not math.isnan(own_scatter), own_scatter * RAD_PER_DEG
+    for j in range(CHUNK):
+        mine = whole[KIND + j] == kind
+        whole[METHOD + j] = method if mine else whole[METHOD + j]
+        whole[AVERAGED + j] = averaged if mine else whole[AVERAGED + j]
+        whole[SKIES + j] = has_sky if mine else whole[SKIES + j]
+        real[SCATTER2 + j] = sigma * sigma if mine & own else real[SCATTER2 + j]
+
+
+@njit(**STEP)
+def _assess_shaded(whole, real):
+    """Assess pixels in shadow for the light of the sky, where their material wants it; the number that is added."""
+    total = np.int32(0)
+    for j in range(CHUNK):
+        f = whole[MARKS + j]
+        shadow = (f & (SELF_SHADOW | CAST_SHADOW)) != 0
+        steep = (real[COS_R + j] >= real[COS_MIN + j]) & (real[COS_R + j] <= real[COS_MAX + j])
+        wanted = (whole[SKIES + j] != 0) & (whole[STATE + j] == REFUSED_STATE) & (whole[MISSING + j] == 0)
+        shaded = wanted & shadow & steep & ((f & (NOT_VIEWED | GRAZING)) == 0)
+        whole[ASSESS + j] = np.int32(SHADED) if shaded else whole[ASSESS + j]
+        whole[STATE + j] = np.int32(NEGLIGIBLE_STATE) if shaded else whole[STATE + j]
+        total = np.int32(total + np.int32(shaded))
+    return total
+
+
+@njit(**STEP)
+def _scale(real, place, factor):
+    """One line times another."""
+    for j in range(CHUNK):
+        real[place + j] *= real[factor + j]
+
+
+@njit(**STEP)
+def _set_factor(whole, real):
+    """(w_eff / w)^2 of the lobe averaged over scattered normals: twin of reference.broadened."""
+    for j in range(CHUNK):
+        factor = ONE / (ONE + TWO * real[W2 + j] * real[SCATTER2 + j])
+        real[FACTOR + j] = factor if whole[AVERAGED + j] != 0 else ONE
+
+
+@njit(**STEP)
+def _set_parts(whole, real, aims, kind, sky, parts):
+    """What one band of one material adds and shows besides the sun's lobe: sky, reference geometry, diffuse part."""
+    of_sky, diffuse_sun, diffuse_sky, back, back_sky = parts[0], parts[1], parts[2], parts[3], parts[4]
+    rate, sigma, sky_sigma = parts[5], parts[6], parts[7]
+    scale, shift = sky[SKY_DEGREE + 1], sky[SKY_DEGREE + 2]
+    s0, s1, s2, s3, s4, s5, s6 = sky[0], sky[1], sky[2], sky[3], sky[4], sky[5], sky[6]
+    s7, s8, s9, s10, s11, s12 = sky[7], sky[8], sky[9], sky[10], sky[11], sky[12]
+    for j in range(CHUNK):
+        mine, level = whole[KIND + j] == kind, (whole[WAYS + j] & LEVEL) != 0
+        lit, good = whole[ASSESS + j] == LIT, whole[ASSESS + j] != 0
+        x = real[COS_R + j] * scale + shift
+        a = (((((s12 * x + s11) * x + s10) * x + s9) * x + s8) * x + s7) * x + s6
+        a = (((((a * x + s5) * x + s4) * x + s3) * x + s2) * x + s1) * x + s0
+        plane = real[COS_I + j] / real[SUN_UP + j] if level else ONE
+        sky_view = (ONE + real.dtype.type(aims[NORMAL + 2 * CHUNK + j])) * HALF if level else ONE
+        shown = diffuse_sun * (plane if lit else ZERO) + diffuse_sky * sky_view
+        real[SKY + j] = (of_sky * a if good else ZERO) if mine else real[SKY + j]
+        real[ALBEDO + j] = a - back_sky if mine else real[ALBEDO + j]
+        real[BACK + j] = (back if lit else ZERO) if mine else real[BACK + j]
+        real[BACK_SKY + j] = (of_sky * back_sky if good else ZERO) if mine else real[BACK_SKY + j]
+        real[DIFFUSE + j] = shown if mine else real[DIFFUSE + j]
+        real[BETA_RATE + j] = rate if mine else real[BETA_RATE + j]
+        real[BETA_SIGMA + j] = sigma if mine else real[BETA_SIGMA + j]
+        real[SKY_SIGMA + j] = sky_sigma if mine else real[SKY_SIGMA + j]
+
+
+@njit(**STEP)
+def _weigh_parts(amounts, direct, line, scale, offset, whole, real):
+    """`_weigh` for any method and with the sky's part; the sun's part is kept in `direct`."""
+    for j in range(line.size):
+        sun = amounts[j]
+        direct[j] = sun
+        r = real.dtype.type(line[j]) * scale + offset
+        bright = r > ZERO
+        specular_part = sun + real[SKY + j]
+        modelled = real[WEIGHT + j] * specular_part
+        total = specular_part + real[DIFFUSE + j]
+        adds = whole[METHOD + j] == REFERENCE
+        of_ratio = (r if bright else ZERO) * modelled / (total if total > ZERO else ONE)
+        normalised = real[WEIGHT + j] * (specular_part - (real[BACK + j] + real[BACK_SKY + j]))
+        a = normalised if adds else of_ratio if whole[METHOD + j] == RATIO else modelled
+        tested = abs(a) if adds else modelled
+        above = (whole[ASSESS + j] != 0) & (tested >= real[NEGLIGIBLE + j]) & (tested > ZERO)
+        part = ((modelled if adds else a) if bright else TWO) / (r if bright else ONE)
+        part = part if above else ZERO
+        real[SHARE + j] = part if part > real[SHARE + j] else real[SHARE + j]
+        amounts[j] = a if above else ZERO
+        whole[HIT + j] |= np.int32(above)
+        whole[OVER + j] |= np.int32(above & (part > real[LIMIT + j]))
+
+
+@njit(**STEP)
+def _set_turns(whole, real):
+    """Relative variance of the lobe from unsure normals: w^4, w^2 and constant parts.
+
+    Twin of reference.direction_variance with `_add_view_turns`. alpha / sin alpha by its series in alpha^2, good to
+    1e-4 up to 90 degrees.
+    """
+    for j in range(CHUNK):
+        good = whole[ASSESS + j] == LIT
+        cos_i, cos_r = real[COS_I + j] if good else ONE, real[COS_R + j] if good else ONE
+        cos_l, alpha2, n2 = real[COS_L + j] if good else ONE, real[ALPHA2 + j], real[SCATTER2 + j]
+        total = cos_i + cos_r
+        per_i, per_r, per_total = ONE / cos_i, ONE / cos_r, ONE / total
+        steeper = cos_i > cos_r  # the exitance
+        inside = ((whole[WAYS + j] & SIMPLIFIED) != 0) | ((cos_r if steeper else cos_i) * total >= cos_l * cos_l)
+        by_i = -per_i if inside else per_total - (per_i if steeper else ZERO)
+        by_i = by_i + (per_i if (whole[WAYS + j] & LEVEL) != 0 else ZERO)
+        by_r = -per_r if inside else per_total - (ZERO if steeper else per_r)
+        along_i, along_r = by_i * cos_i, by_r * cos_r
+        c2, both = cos_l * cos_l, by_i + by_r
+        stretch = ((((T5 * alpha2 + T4) * alpha2 + T3) * alpha2 + T2) * alpha2 + T1) * alpha2 + ONE
+        of_w2 = stretch * (both * cos_l - (along_i + along_r) * total * HALF / cos_l)
+        across = by_i * by_r * (c2 - ONE)
+        of_1 = both * both + FOUR * across - (along_i + along_r) * (along_i + along_r)
+        real[BY_R + j], real[STRETCH + j] = by_r, stretch
+        real[TURNS_W4 + j] = n2 * FOUR * (alpha2 + n2)
+        real[TURNS_W2 + j] = n2 * FOUR * of_w2
+        real[TURNS + j] = n2 * of_1
+
+
+@njit(**STEP)
+def _add_view_turns(whole, real, view_variance):
+    """Add the variance from the direction to the sensor to that of `_set_turns`."""
+    v2 = real.dtype.type(view_variance)
+    for j in range(CHUNK):
+        good = whole[ASSESS + j] == LIT
+        cos_r, per_l = real[COS_R + j] if good else ONE, ONE / (real[COS_L + j] if good else ONE)
+        lean, alpha2 = (cos_r - (real[COS_I + j] if good else ONE)) * HALF, real[ALPHA2 + j]
+        by_r, stretch = real[BY_R + j], real[STRETCH + j]
+        real[TURNS_W4 + j] += v2 * (alpha2 - stretch * stretch * lean * lean) * per_l * per_l
+        real[TURNS_W2 + j] += v2 * TWO * by_r * (alpha2 / stretch - stretch * cos_r * lean) * per_l
+        real[TURNS + j] += v2 * by_r * by_r * (ONE - cos_r * cos_r)
+
+
+@njit(**STEP)
+def _set_spread(whole, real, kind, w2, c):
+    """Relative variance of the lobe of one material in one band: from its parameters, and with the directions."""
+    c5, c4, c3, c2, c1, c0 = c[5], c[4], c[3], c[2], c[1], c[0]
+    d5, d4, d3, d2, d1, d0 = c[11], c[10], c[9], c[8], c[7], c[6]
+    of_alpha4, scale, shift = c[12], c[13], c[14]
+    for j in range(CHUNK):
+        x, alpha2 = real[COS_L + j] * scale + shift, real[ALPHA2 + j]
+        at_top = ((((c5 * x + c4) * x + c3) * x + c2) * x + c1) * x + c0
+        by_alpha2 = ((((d5 * x + d4) * x + d3) * x + d2) * x + d1) * x + d0
+        of_material = at_top + alpha2 * (by_alpha2 + alpha2 * of_alpha4)
+        of_material = of_material if of_material > ZERO else ZERO
+        turned = (real[TURNS_W4 + j] * w2 + real[TURNS_W2 + j]) * w2 + real[TURNS + j]
+        turned = turned if turned > ZERO else ZERO
+        mine = whole[KIND + j] == kind
+        real[OF_MATERIAL + j] = of_material if mine else real[OF_MATERIAL + j]
+        real[SPREAD + j] = of_material + turned if mine else real[SPREAD + j]
+
+
+@njit(**STEP)
+def _set_cross(whole, real, kind, c, variance):
+    """Relative covariance of the lobe of one material and that at the reference geometry; variance of the latter."""
+    scale, shift = variance[13], variance[14]
+    for j in range(CHUNK):
+        x = real[COS_L + j] * scale + shift
+        at_top = ((((c[5] * x + c[4]) * x + c[3]) * x + c[2]) * x + c[1]) * x + c[0]
+        mine = whole[KIND + j] == kind
+        real[CROSS + j] = at_top + c[6] * real[ALPHA2 + j] if mine else real[CROSS + j]
+        real[BACK_VARIANCE + j] = c[7] if mine else real[BACK_VARIANCE + j]
+
+
+@njit(**STEP)
+def _spread(sigma, amounts, line, scale, offset, noise, saturation, whole, real):
+    """1 sigma of one corrected band, and where that of what is removed exceeds half of what is left: subtraction."""
+    base, share = real.dtype.type(noise[0]), real.dtype.type(noise[1])
+    for j in range(line.size):
+        a, value = amounts[j], real.dtype.type(line[j])
+        a = a if (value < saturation) & (whole[TAKE + j] != 0) else ZERO
+        r = value * scale + offset
+        left = r - a if r > a else ZERO
+        variance = a * a * real[SPREAD + j]
+        seen = base + share * (r if r > ZERO else ZERO)
+        sigma[j] = np.sqrt(seen * seen + variance) * real[HOLE + j]
+        whole[UNSURE + j] |= np.int32(FOUR * variance > left * left)
+
+
+@njit(**STEP)
+def _spread_parts(sigma, amounts, direct, line, scale, offset, saturation, whole, real):
+    """`_spread` for any method and with the sky's part: twin of the sigma in reference.correct_block."""
+    for j in range(line.size):
+        a, value, noise, sun = amounts[j], real.dtype.type(line[j]), real.dtype.type(sigma[j]), direct[j]
+        r = value * scale + offset
+        seen = r if r > ZERO else ZERO
+        left = r - a
+        left = left if left > ZERO else ZERO
+        back, specular_part = real[BACK + j], sun + real[SKY + j]
+        of_material = sun * sun * real[OF_MATERIAL + j] + back * (
+            back * real[BACK_VARIANCE + j] - TWO * sun * real[CROSS + j]
+        )
+        error = np.sqrt(of_material if of_material > ZERO else ZERO)
+        error = error + abs(real[SKY + j] - real[BACK_SKY + j]) * real[SKY_SIGMA + j]
+        of_beta = (sun - back) * real[BETA_RATE + j] - real[ALBEDO + j] * real[BETA_SIGMA + j]
+        variance = error * error + sun * sun * (real[SPREAD + j] - real[OF_MATERIAL + j]) + of_beta * of_beta
+        total = specular_part + real[DIFFUSE + j]
+        per_total = ONE / (total if total > ZERO else ONE)
+        is_ratio = whole[METHOD + j] == RATIO
+        change = real[WEIGHT + j] * (seen * real[DIFFUSE + j] * per_total * per_total if is_ratio else ONE)
+        kept = ONE - real[WEIGHT + j] * specular_part * per_total if is_ratio else ONE
+        variance = variance * change * change
+        take = (a != ZERO) & (value < saturation)
+        take = take & (whole[TAKE + j] != 0)
+        sigma[j] = np.sqrt(noise * noise * kept * kept + variance) if take else noise
+        whole[UNSURE + j] |= np.int32(take & (FOUR * variance > left * left))
+
+
+@njit(**STEP)
+def _mark_unsure(whole):
+    """Flag the pixels that `_spread` found unsure."""
+    for j in range(CHUNK):
+        whole[MARKS + j] |= UNCERTAIN if whole[UNSURE + j] != 0 else NO_FLAG

@@ -191,11 +191,11 @@ class Corrector:
         rules, tally = self._pixels[np.dtype(real)], results.tally
         options = np.array([self.skip, first_row, self.tally_stride], dtype=np.int64)
         extras = None if engine.extras is None else _of_block(engine.extras, inputs, results.sigma)
-        if engine.precision == "reference" or extras is not None:
+        if engine.precision == "reference":
             reference.correct_block(*block, rules, tally, options, extras)
         else:
             scratch = kernels.new_scratch(len(inputs.image), real)
-            kernels.correct_block(*block, engine.polynomials, rules, tally, scratch, options)
+            kernels.correct_block(*block, engine.polynomials, rules, tally, scratch, options, extras)
 
 
 @dataclass(frozen=True, slots=True)
