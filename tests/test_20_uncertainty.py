@@ -3,15 +3,20 @@
 The draws perturb parameters, directions, direct fraction and image, and put them through the equations of the paper.
 """
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tscorr import reference
 from tscorr.angles import unit_vector
+from tscorr.api import correct
 from tscorr.correction import BlockInputs, Corrector, PixelFlag, ReferenceDirections, Rules, Stored
+from tscorr.correction.albedo import specular_albedo
 from tscorr.correction.covariance import ORIGINS, covariances, origin, paper_directions, synthetic_covariance
+from tscorr.correction.sky import SKY_ERROR, sky_polynomial
 from tscorr.materials import PARAMETERS, Material, builtin_materials, material
 
 TABLE_1 = [surface for surface in builtin_materials().values() if surface.has_peak]
@@ -293,3 +298,81 @@ def test_variance_of_directions_is_the_gradient_of_the_lobe(simplified, horizont
         np.testing.assert_allclose(
             found[kept], squared_gradient([sun, view, normal], shaken, **options)[kept], rtol=1e-3
         )
+
+
+# The other methods, and the sky
+
+CORRECTIONS = json.loads((Path(__file__).parent / "data" / "paper_values.json").read_text(encoding="utf-8"))[
+    "corrections"
+]
+
+
+def one_pixel(value, surface, rules, sun, view, **options):
+    """Corrected value of one pixel."""
+    result = correct(np.full((1, 1, 1), value, np.float32), [[1]], {1: surface}, sun, view, rules=rules, **options)
+    return float(result.corrected[0, 0, 0])
+
+
+@pytest.mark.parametrize("precision", ["fast", "reference"])
+@pytest.mark.parametrize("row", CORRECTIONS, ids=lambda row: row["material"])
+def test_ratio_and_reference_of_the_50_digit_table(row, precision):
+    """The ratio as it stands; the reference of a brighter pixel, as the table's own falls below zero on the way."""
+    sun = unit_vector(float(row["theta_i"]), 180.0)
+    view = unit_vector(float(row["theta_r"]), 180 - float(row["phi"]))
+    directions = ReferenceDirections(*map(float, row["reference"].split(",")))
+    settings = {"precision": precision, "direct_fraction": (float(row["beta"]),), "reference": directions}
+    signal = float(row["R"])
+    found = one_pixel(signal, row["material"], Rules(method="ratio", **settings), sun, view)
+    assert found == pytest.approx(float(row["ratio"]), rel=2e-5)
+    found = one_pixel(signal + 4, row["material"], Rules(method="reference", **settings), sun, view)
+    assert found - 4 == pytest.approx(float(row["to_reference_additive"]), abs=3e-6)
+
+
+@pytest.mark.parametrize("surface", TABLE_1, ids=lambda surface: surface.name)
+def test_the_polynomial_of_the_sky_keeps_its_error(surface):
+    """Against the integral at angles between its nodes; in reflectance a tenth of a step of 1e-4 at most."""
+    w, n, k = (getattr(surface, name)[0] for name in ("w", "n", "k"))
+    row = np.array(sky_polynomial(w, n, k, 85.0))
+    exitance_deg = np.array([0.0, 7, 21, 38, 52, 63, 71, 77, 81, 84.9])
+    x = np.sin(np.deg2rad(90 - exitance_deg)) * row[-2] + row[-1]
+    found, exact = np.polynomial.polynomial.polyval(x, row[:-2]), specular_albedo(exitance_deg, w=w, n=n, k=k)
+    assert np.abs(found / exact - 1).max() < SKY_ERROR
+    assert np.abs(found - exact)[:-3].max() * surface.t1[0] * 0.2 < 1e-5
+
+
+@pytest.mark.parametrize("precision", ["fast", "reference"])
+def test_in_shadow_only_the_light_of_the_sky_is_taken(precision):
+    """(1 - beta) times the albedo of the lobe, in sun and shadow alike; without the setting shadow is not assessed."""
+    surface, sun, view = material("roof_tile"), unit_vector(50.0, 180.0), unit_vector(40.0, 0.0)
+    w, n, k = (getattr(surface, name)[0] for name in ("w", "n", "k"))
+    sky = 0.3 * surface.t1[0] * float(specular_albedo(40.0, w=w, n=n, k=k))
+    assert sky > 0.01
+    with_sky, without = (
+        Rules(sky_specular=asked, direct_fraction=(0.7,), precision=precision) for asked in (True, False)
+    )
+    assert 0.9 - one_pixel(0.9, surface, with_sky, sun, view, shadowed=True) == pytest.approx(sky, rel=3e-4)
+    assert one_pixel(0.9, surface, without, sun, view, shadowed=True) == np.float32(0.9)
+    lit = one_pixel(0.9, surface, without, sun, view) - one_pixel(0.9, surface, with_sky, sun, view)
+    assert lit == pytest.approx(sky, rel=3e-4)
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"average_normals": True}, {"method": "reference"}, {"method": "ratio"}, {"sky_specular": True}]
+)
+def test_skipping_changes_no_value_and_no_sigma(settings):
+    rng = np.random.default_rng(35)
+    shape = 6, 300
+    normal = unit_vector(rng.uniform(0, 40, shape), rng.uniform(0, 360, shape))
+    image, classes = rng.uniform(0.05, 0.9, (1, *shape)).astype(np.float32), np.sort(rng.integers(0, 3, shape), axis=1)
+    sun, view = unit_vector(40.0, 180.0), unit_vector(40.0, 180.0)  # away from the peak of level ground
+    options = {
+        "rules": Rules(direct_fraction=(0.8,), **settings),
+        "uncertainty": True,
+        "image_noise": NOISE,
+        "normal_sigma_deg": rng.uniform(0, 3, shape),
+        "weight": rng.uniform(0, 1, shape),
+    }
+    surfaces = {1: "red_aluminum", 2: "red_concrete"}
+    skip, all_ = (correct(image, classes, surfaces, sun, view, normal, skip=skip, **options) for skip in (True, False))
+    for name in ("corrected", "removed", "flags", "sigma"):
+        assert getattr(skip, name).tobytes() == getattr(all_, name).tobytes(), name

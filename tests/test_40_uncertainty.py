@@ -129,7 +129,7 @@ def test_a_pixel_that_is_half_roof_loses_half_the_lobe(tmp_path):
 
 def test_ratio_needs_the_diffuse_part_of_every_band(tmp_path):
     with pytest.raises(
-        InputError, match="needs t0 of every band, but that of material 'roof_tile' is known at 0.55 um"
+        InputError, match=r"needs t0 of every band, but that of material 'roof_tile' is known at 0.55 um"
     ):
         plan(small_scene(tmp_path, correction={"method": "ratio"}))
 
