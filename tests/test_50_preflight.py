@@ -107,7 +107,7 @@ def test_what_is_done_and_what_is_replaced_needs_no_disk(tmp_path, monkeypatch):
 
 
 def test_an_estimate_of_the_disk_bounds_what_is_written(tmp_path):
-    every = ["corrected", "flags", "removed", "azimuthal_width", "angles"]
+    every = ["corrected", "flags", "removed", "uncertainty", "azimuthal_width", "angles"]
     for kind in ("gtiff", "cog"):
         folder = tmp_path / kind
         folder.mkdir()

@@ -61,7 +61,8 @@ def disk_bytes(scene: Scene) -> tuple[float, float]:
     image, output = scene.image, scene.config.output
     pixels = image.shape[0] * image.shape[1]
     image_bytes = pixels * pixel_bytes(image)
-    each = [pixels * PRODUCT_BYTES[p] if p in PRODUCT_BYTES else image_bytes for p in output.products]
+    sizes = {name: pixels * size for name, size in PRODUCT_BYTES.items()} | {"uncertainty": 4 * pixels * image.bands}
+    each = [sizes.get(product, image_bytes) for product in output.products]
     most = sum(each) * OVERVIEWS + max(each, default=0) if output.format == "cog" else sum(each)
     most += BESIDE_BYTES
     if "corrected" not in output.products:
