@@ -228,7 +228,7 @@ def test_flags_and_state_of_a_pixel(arguments, flags, state, precision):
 
 
 def test_flags_of_the_inputs_are_kept():
-    """What is known before the correction: quality everywhere, shadow and view only where a peak may be."""
+    """What is known before the correction: the class's confidence everywhere, the rest only where a peak may be."""
     shape = 1, 4
     everywhere = np.ones(shape, bool)
     inputs = BlockInputs(
@@ -245,13 +245,13 @@ def test_flags_of_the_inputs_are_kept():
     surfaces = [material("roof_tile"), material("lambertian")]
     stored = Stored(dtype=np.dtype(np.float32), scale=(1.0,), offset=(0.0,))
     result = Corrector([(surface, surface.at(), Rules()) for surface in surfaces], stored)(inputs)
-    quality = PixelFlag.NORMAL_UNRELIABLE | PixelFlag.LOW_CONFIDENCE
+    doubt = PixelFlag.LOW_CONFIDENCE
     not_assessed = NOT_ASSESSED << 6
     expected = [
-        quality | PixelFlag.CAST_SHADOW | PixelFlag.NOT_VIEWED | not_assessed,
-        quality,
-        quality | PixelFlag.NODATA | not_assessed,
-        quality | PixelFlag.NO_MATERIAL | not_assessed,
+        doubt | PixelFlag.NORMAL_UNRELIABLE | PixelFlag.CAST_SHADOW | PixelFlag.NOT_VIEWED | not_assessed,
+        doubt,
+        doubt | PixelFlag.NODATA | not_assessed,
+        doubt | PixelFlag.NO_MATERIAL | not_assessed,
     ]
     np.testing.assert_array_equal(result.flags, [expected])
     np.testing.assert_array_equal(result.tally.states, [[0, 0, 0, 1], [0, 0, 0, 2], [1, 0, 0, 0]])
@@ -364,8 +364,9 @@ def test_saturation_of_one_band_decides_for_all():
         ("int16", {"scale": 1e-4}, -5, -5, True),
         ("uint8", {"scale": 0.004}, 20, 0, True),
         ("float32", {}, 0.1, 0, True),
-        ("float32", {"nodata": 0}, 0.1, np.finfo(np.float32).tiny, True),
+        ("float32", {"nodata": 0}, 0.1, np.float32(0.1) - (np.float32(0.1) - np.float32(1e-5)), True),
         ("float32", {"nodata": 0}, 0.0, 0, False),
+        ("float32", {"offset": -0.0301}, 0.2, np.float32(0.2) - (np.float32(0.2) - np.float32(0.0301)), True),
     ],
 )
 def test_what_a_clipped_value_becomes(dtype, options, value, expected, clipped, precision):
@@ -374,6 +375,7 @@ def test_what_a_clipped_value_becomes(dtype, options, value, expected, clipped, 
     rules = Rules(precision=precision)
     result = tscorr.correct(image, [[1]], {1: "red_concrete"}, *PEAK, rules=rules, **options)
     assert result.corrected[0, 0] == np.array(expected, dtype)
+    assert result.corrected[0, 0] == image[0, 0] - result.removed[0, 0]
     assert bool(result.flags[0, 0] & PixelFlag.CLIPPED) is clipped
     assert bool(result.flags[0, 0] & PixelFlag.NODATA) is (not clipped)
 

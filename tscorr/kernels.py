@@ -34,7 +34,7 @@ NOT_VIEWED, GRAZING = np.uint16(16), np.uint16(32)
 CORRECTED, UNCORRECTABLE, NOT_ASSESSED = np.uint16(1 << 6), np.uint16(2 << 6), np.uint16(3 << 6)
 SATURATED, CLIPPED = np.uint16(256), np.uint16(512)
 HIDDEN = np.uint16(8 | 16)
-QUALITY = np.uint16(2048 | 4096)
+DOUBT = np.uint16(4096)
 ON_ENTRY = np.uint16(8 | 16 | 2048 | 4096)
 
 # SPECULAR_STATE, in bits 6 and 7.
@@ -334,8 +334,8 @@ def correct_block(
     image    : (bands, rows, cols), stored values; changed in place.
     removed  : the same shape and type, zeros on entry: what was taken away. Or of no rows: not wanted.
     flags    : uint16 (rows, cols). On entry CAST_SHADOW, NOT_VIEWED, NORMAL_UNRELIABLE, LOW_CONFIDENCE where
-               they hold; on exit all bits of PixelFlag. Shadow and view bits are cleared where no material
-               has a peak, since there nobody looked.
+               they hold; on exit all bits of PixelFlag. Those of the geometry are cleared where no material has a
+               peak and where there are no data, since there nobody looks.
     material : uint8 (rows, cols), rows of `table`; 0 is no material.
     sun, view, normal : unit vectors, float64 (3, rows, cols), or (3, 1, 1) where constant.
     polynomials : (materials, bands, FRESNEL_DEGREE + 3), F in x = cos_l * scale + shift: lowest power first, then
@@ -484,9 +484,9 @@ def _mark_known(whole):
     for j in range(CHUNK):
         gap, wanted = whole[MISSING + j] != 0, whole[ASSESS + j] != 0
         none = whole[KIND + j] == 0
-        f = whole[MARKS + j] & (ON_ENTRY if wanted else QUALITY)
+        f = whole[MARKS + j] & (ON_ENTRY if wanted else DOUBT)
         f |= (NO_MATERIAL if none else NO_FLAG) | (SATURATED if whole[SATURATES + j] != 0 else NO_FLAG)
-        whole[MARKS + j] = (whole[MARKS + j] & QUALITY) | NODATA if gap else f
+        whole[MARKS + j] = (whole[MARKS + j] & DOUBT) | NODATA if gap else f
         whole[STATE + j] = REFUSED_STATE if gap | none else NEGLIGIBLE_STATE
         whole[ASSESS + j] = np.int32(wanted & (not gap))
 
@@ -759,14 +759,17 @@ def _settle(whole):
 
 @njit(**STEP)
 def _subtract(amounts, line, rules, b, whole, real):
-    """One band less its amounts, in whole steps and held above 0; `amounts` become what was taken."""
+    """One band less its amounts, in whole steps and held above 0; `amounts` become what was taken.
+
+    In floating point the result is the difference of the two as they are stored, and so exactly input - removed.
+    """
     steps, least, saturation = rules.steps[b], rules.lowest[b], rules.saturation[b]
     dodges, integer, blank = rules.dodge, rules.integer, real.dtype.type(rules.nodata[0])
     for j in range(line.size):
         value = real.dtype.type(line[j])
         part = amounts[j] * steps
         if integer is None:
-            part = real.dtype.type(line.dtype.type(part))  # so that input - removed is exact in the file
+            part = real.dtype.type(line.dtype.type(part))
         else:
             part = part + HALF
             part = real.dtype.type(np.int32(part if part < MOST_STEPS else MOST_STEPS))
@@ -779,9 +782,12 @@ def _subtract(amounts, line, rules, b, whole, real):
         take = (amounts[j] != ZERO) & (value < saturation)
         take = take & (whole[TAKE + j] != 0)
         whole[CLIPS + j] |= np.int32(take & (low | dodge))
-        new = new if take else value
-        amounts[j] = value - new
-        line[j] = new
+        taken = value - new if take else ZERO
+        if integer is None:
+            taken = real.dtype.type(line.dtype.type(taken))
+            new = value - taken
+        amounts[j] = taken
+        line[j] = new if take else value
 
 
 @njit(**STEP)
@@ -972,9 +978,12 @@ def _exchange(amounts, line, rules, b, highest, whole, real):
         new = new + ONE if dodge else new
         take = (amounts[j] != ZERO) & (value < saturation) & (whole[TAKE + j] != 0)
         whole[CLIPS + j] |= np.int32(take & (low | high | dodge))
-        new = new if take else value
-        amounts[j] = value - new
-        line[j] = new
+        taken = value - new if take else ZERO
+        if integer is None:
+            taken = real.dtype.type(line.dtype.type(taken))
+            new = value - taken
+        amounts[j] = taken
+        line[j] = new if take else value
 
 
 @njit(**STEP)

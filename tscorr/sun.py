@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from tscorr.angles import grid_azimuth, true_azimuth, unit_vector, zenith_azimuth
+from tscorr.angles import angle_between, grid_azimuth, true_azimuth, unit_vector, zenith_azimuth
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid, convergence_deg, convergences_deg, longitude_latitude, require_crs
 
@@ -52,6 +52,10 @@ class Sun(Protocol):
     def center(self) -> Array:
         """Unit vector (3,) at the middle of the scene."""
 
+    @property
+    def spread_deg(self) -> float:
+        """No sun of the scene is farther from that of its centre; inf where that is not known."""
+
     def vectors(self, block: Block, seconds: Array | None = None) -> Array:
         """Unit vectors over a block: (3, rows, cols), or (3, 1, 1) where the sun is constant.
 
@@ -79,6 +83,11 @@ class SunField:
         """Unit vector (3,) at the middle of the scene."""
         mean = self.corners.mean(axis=(1, 2))
         return mean / np.linalg.norm(mean)
+
+    @property
+    def spread_deg(self) -> float:
+        """The farthest of the corners: between them lies all else."""
+        return float(angle_between(self.corners, self.center[:, None, None]).max())
 
     @property
     def is_constant(self) -> bool:
@@ -120,6 +129,11 @@ class SunTrack:
         """Unit vector (3,) at the middle of the scene, when it was seen."""
         return self._at(np.array([0.5]), np.array([0.5]), np.array([[self.middle_s]]))[:, 0, 0]
 
+    @property
+    def spread_deg(self) -> float:
+        """The farthest of the knots: between them lies all else."""
+        return float(angle_between(self.knots, self.center[:, None, None, None]).max())
+
     def vectors(self, block: Block, seconds: Array | None = None) -> Array:
         """Unit vectors (3, rows, cols) when each pixel was seen; where that is not known, when the centre was."""
         if seconds is None:
@@ -144,6 +158,11 @@ class SunRaster:
     azimuth_deg: float
     convergence_deg: float
     time: datetime | None = None
+
+    @property
+    def spread_deg(self) -> float:
+        """Not known: a raster may hold any sun."""
+        return math.inf
 
     def vectors(self, block: Block, seconds: Array | None = None) -> Array:
         """Unit vectors (3, rows, cols)."""

@@ -48,6 +48,9 @@ class Output(Section):
     compression: Literal["none", "deflate", "zstd", "lzw"] | None = Field(
         None, description="codec of the results; default: the input's"
     )
+    corrected: Literal["file", "vrt"] = Field(
+        "file", description="vrt: only what was removed is written, and a small file that subtracts it from the image"
+    )
     quicklook: bool = Field(True, description="draw a true-colour picture: before, after, flags")
 
 
@@ -371,6 +374,24 @@ class Config(Section):
     run: Run = Run()
     materials: Materials
     scenes: list[Scene] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _vrt_is_a_difference(self) -> "Config":
+        if self.output.corrected == "vrt":
+            if self.output.format == "envi":
+                raise ValueError("output.corrected = 'vrt' needs output.format = 'gtiff' or 'cog', not 'envi'")
+            if "corrected" not in self.output.products:
+                raise ValueError("output.corrected = 'vrt' needs 'corrected' among the output.products")
+            policies = {"correction": self.correction.uncorrectable} | {
+                f"materials.settings.{name}": own.uncorrectable for name, own in self.materials.settings.items()
+            }
+            for table, policy in policies.items():
+                if policy == "nodata":
+                    raise ValueError(
+                        f"{table}.uncorrectable = 'nodata' cannot be had with output.corrected = 'vrt': a difference "
+                        f"makes no nodata; allowed are 'best' and 'keep', or output.corrected = 'file'"
+                    )
+        return self
 
     @model_validator(mode="after")
     def _settings_are_used(self) -> "Config":

@@ -1,10 +1,10 @@
 """The specular peak taken out of a block of an image: pure arrays in, arrays and flags out."""
 
 from tscorr.correction.corrector import BlockInputs, BlockResult, Corrector, class_rows
-from tscorr.correction.extras import check_ratio
+from tscorr.correction.extras import check_ratio, is_extra
 from tscorr.correction.flags import SINGLE_FLAGS, PixelFlag, SpecularState, specular_state
 from tscorr.correction.rules import NEGLIGIBLE_REFLECTANCE, ReferenceDirections, Rules, Stored
-from tscorr.correction.tables import add_tally, new_tally
+from tscorr.correction.tables import add_angles, add_tally, new_tally, steepest_deg
 
 __all__ = [
     "NEGLIGIBLE_REFLECTANCE",
@@ -17,9 +17,12 @@ __all__ = [
     "Rules",
     "SpecularState",
     "Stored",
+    "add_angles",
     "add_tally",
     "check_ratio",
     "class_rows",
+    "is_extra",
     "new_tally",
     "specular_state",
+    "steepest_deg",
 ]

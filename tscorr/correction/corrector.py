@@ -28,7 +28,7 @@ Array = NDArray[Any]
 class BlockInputs:
     """One block of a scene.
 
-    image    : (bands, rows, cols), stored values; corrected in place.
+    image    : (bands, rows, cols), stored values; corrected in place. Of no bands where no value of it matters.
     material : uint8 (rows, cols), the material's place in the `Corrector`, from 1; 0 is none.
     sun, view, normal : unit vectors (3, rows, cols), or (3, 1, 1) where constant; east, north, up.
     shadowed, hidden, unreliable, low_confidence : bool (rows, cols), or None where nowhere true.
@@ -140,20 +140,37 @@ class Corrector:
         """Which rows have a lobe to remove: bool (materials + 1,); row 0, no material, has none."""
         return np.logical_or.reduce([engine.table.peak for engine in self._engines])
 
+    def passed_through(self, inputs: BlockInputs) -> BlockResult:
+        """The block as it is where it is known that nothing of it is to be removed; directions are not looked at.
+
+        The flags of pixels that are lit, seen, and neither hidden nor too steep, as the correction gives them.
+        """
+        idle = replace(self._engines[0], table=self._engines[0].table._replace(peak=np.zeros_like(self.peaks)))
+        results = self._results(inputs, everywhere=inputs.image.shape, want_removed=False)
+        self._run(idle, inputs, results, 0)
+        return self._result(inputs, results, want_removed=False)
+
     def __call__(self, inputs: BlockInputs, *, first_row: int = 0, want_removed: bool = True) -> BlockResult:
         """The block without its specular part; `inputs.image` is changed in place."""
-        bands, *shape = inputs.image.shape
-        everywhere, nowhere = (bands, *shape), (bands, 0, 0)
-        results = _Results(
-            removed=np.zeros(everywhere if want_removed else nowhere, self.removed_type),
-            sigma=np.empty(everywhere if self.uncertainty else nowhere, np.float32),
-            flags=inputs.flags(),
-            tally=new_tally(len(self.names) + 1, bands),
-        )
+        results = self._results(inputs, everywhere=inputs.image.shape, want_removed=want_removed)
         if len(self._engines) == 1:
             self._run(self._engines[0], inputs, results, first_row)
         else:
             self._run_each(inputs, results, first_row)
+        return self._result(inputs, results, want_removed=want_removed)
+
+    def _results(self, inputs: BlockInputs, *, everywhere: tuple[int, ...], want_removed: bool) -> "_Results":
+        """What the engines write into, empty."""
+        nowhere = (everywhere[0], 0, 0)
+        return _Results(
+            removed=np.zeros(everywhere if want_removed else nowhere, self.removed_type),
+            sigma=np.empty(everywhere if self.uncertainty else nowhere, np.float32),
+            flags=inputs.flags(),
+            tally=new_tally(len(self.names) + 1, len(self.stored.scale)),
+        )
+
+    def _result(self, inputs: BlockInputs, results: "_Results", *, want_removed: bool) -> BlockResult:
+        """What they wrote, as it was asked for."""
         return BlockResult(
             corrected=inputs.image,
             removed=results.removed if want_removed else None,

@@ -11,8 +11,8 @@ Array = NDArray[Any]
 class PixelFlag(IntFlag):
     """What was done to a pixel, and why not more. Two bits hold the `SpecularState`.
 
-    SELF_SHADOW to GRAZING, and the state, are assessed where a material with a peak is; LOW_CONFIDENCE and
-    NORMAL_UNRELIABLE say how good the inputs were.
+    SELF_SHADOW to GRAZING, NORMAL_UNRELIABLE and the state are assessed where a material with a peak has data;
+    LOW_CONFIDENCE says how sure the class was.
     """
 
     NODATA = 1 << 0

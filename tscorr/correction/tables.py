@@ -18,6 +18,8 @@ Entry = tuple[Material, BandParameters, Rules]
 """a material, its parameters for each band, and how it is corrected"""
 
 MAX_ZENITH_DEG = {"full": 85.0, "simplified": 70.0}
+BESIDE_NODATA = 1e-5
+"""reflectance that a clipped value of a floating-point image keeps where 0 means nodata; not lost beside a 100"""
 FRESNEL_ERROR = 3e-6
 """relative error up to which a polynomial stands in for the Fresnel equations"""
 
@@ -30,7 +32,7 @@ def pixel_rules(stored: Stored) -> dict[np.dtype[Any], kernels.PixelRules]:
     black = -offset / scale
     lowest = np.maximum(np.ceil(black - 1e-9), np.iinfo(dtype).min) if integer else black
     if not integer and stored.nodata == 0:
-        lowest = np.where(lowest == 0, np.finfo(np.float32).tiny, lowest)
+        lowest = np.where(lowest == 0, BESIDE_NODATA / scale, lowest)
     saturation = np.full(bands, np.inf) if stored.saturation is None else np.array(stored.saturation)
     nodata = stored.nodata if stored.nodata is not None and stored.has_nodata else 0
     has_nodata = stored.has_nodata and not np.isnan(nodata)
@@ -188,10 +190,18 @@ def new_tally(materials: int, bands: int) -> kernels.Tally:
 
 def add_tally(total: kernels.Tally, part: kernels.Tally) -> None:
     """Add the sums of a block to those of the scene; integers and extremes, so no order matters."""
-    for name in ("states", "removed", "incidence", "tilt", "share", "out_of_lobe"):
+    for name in ("states", "removed", "share", "out_of_lobe"):
         sums = getattr(total, name)
         sums += getattr(part, name)
-    total.extremes[:, 0] = np.minimum(total.extremes[:, 0], part.extremes[:, 0])
+    add_angles(total, part)
     total.extremes[:, 1] = np.maximum(total.extremes[:, 1], part.extremes[:, 1])
     total.attenuated[0] += part.attenuated[0]
     total.attenuated[1] = max(total.attenuated[1], part.attenuated[1])
+
+
+def add_angles(total: kernels.Tally, part: kernels.Tally) -> None:
+    """Add the statistics of incidence and facet tilt, and nothing else."""
+    for name in ("incidence", "tilt"):
+        sums = getattr(total, name)
+        sums += getattr(part, name)
+    total.extremes[:, 0] = np.minimum(total.extremes[:, 0], part.extremes[:, 0])

@@ -3,6 +3,7 @@
 GDAL never applies scale and offset; neither does anything here: blocks hold stored values.
 """
 
+from tscorr.rasters.difference import expressible, write_difference
 from tscorr.rasters.envi_writing import ENVI_SUFFIX, EnviWriter
 from tscorr.rasters.header import IMAGE_TYPES, RasterInfo, can_hold, check_metric, check_overlap, describe, opened
 from tscorr.rasters.joining import join_rows, result
@@ -23,6 +24,7 @@ __all__ = [
     "check_metric",
     "check_overlap",
     "describe",
+    "expressible",
     "join_rows",
     "make_cog",
     "opened",
@@ -30,4 +32,5 @@ __all__ = [
     "read_decimated_flags",
     "read_samples",
     "result",
+    "write_difference",
 ]

@@ -25,6 +25,13 @@ class Tiles(NamedTuple):
     offsets: Array
     sizes: Array
 
+    def of(self, used: Array) -> "Tiles":
+        """Some of the tiles: bool (tiles,)."""
+        parts = [self.data[start : start + size] for start, size in zip(self.offsets, self.sizes, strict=True)]
+        data = b"".join(part for part, wanted in zip(parts, used, strict=True) if wanted)
+        sizes = self.sizes[used]
+        return Tiles(memoryview(data), np.cumsum(sizes) - sizes, sizes)
+
 
 class Encoder:
     """Encodes blocks of whole tiles for one file.

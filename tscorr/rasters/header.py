@@ -1,6 +1,6 @@
 """What the header of a raster says, checked before a pixel is read."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -84,10 +84,11 @@ def opened(path: Path, *, ours: bool = False) -> Iterator[Any]:
         raise InputError(f"{path} cannot be read: {reason_of(error, path)}") from None
 
 
-def describe(path: str | Path, *, ours: bool = False) -> RasterInfo:
+def describe(path: str | Path, *, ours: bool = False, draws_on: Sequence[Path] = ()) -> RasterInfo:
     """The header of a raster, checked before a pixel is read.
 
-    ours : a result of this program, which may be a VRT.
+    ours     : a result of this program, which may be a VRT.
+    draws_on : files elsewhere that it may draw on.
     Raises InputError where the file is missing, is no raster, or declares what no honest file does.
     """
     path = Path(path)
@@ -96,7 +97,7 @@ def describe(path: str | Path, *, ours: bool = False) -> RasterInfo:
     if not path.is_file():
         raise InputError(f"{path} is no file; allowed is a raster")
     with opened(path, ours=ours) as dataset:
-        check_sound(dataset, path)
+        check_sound(dataset, path, draws_on)
         dtype = np.dtype(dataset.dtypes[0])
         rows, cols = dataset.block_shapes[0]
         fields = dataset.tags(ns="ENVI") if dataset.driver == "ENVI" else {}

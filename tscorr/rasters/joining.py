@@ -40,11 +40,14 @@ def join_rows(parts: Sequence[Path], path: Path) -> None:
     tree.write(path, encoding="utf-8")
 
 
-def result(folder: Path, product: str) -> RasterInfo | None:
-    """A product in a folder of results: one file, or the VRT of several; None where there is neither."""
+def result(folder: Path, product: str, image: RasterInfo | None = None) -> RasterInfo | None:
+    """A product in a folder of results: one file, or a VRT of several; None where there is neither.
+
+    image : the image of the scene, from which a VRT may subtract what was removed.
+    """
     files = (folder / f"{product}{suffix}" for suffix in (".vrt", ".tif", ".dat"))
     found = next((file for file in files if file.exists()), None)
-    return None if found is None else describe(found, ours=True)
+    return None if found is None else describe(found, ours=True, draws_on=() if image is None else image.files)
 
 
 def _rows(path: Path) -> int:

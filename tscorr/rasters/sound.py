@@ -6,7 +6,7 @@ an ENVI file that is shorter than its header says reads as zeros, and an overvie
 
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import count
 from pathlib import Path
@@ -56,15 +56,18 @@ def open_dataset(path: Path, *, ours: bool = False, **options: Any) -> Any:
     raise RasterioError(known[0] if known else f"it is in none of the formats {', '.join(DRIVERS)}")
 
 
-def check_sound(dataset: Any, path: Path) -> None:
-    """Raise InputError where a header declares what no honest file has; names the file and what is allowed."""
+def check_sound(dataset: Any, path: Path, draws_on: Sequence[Path] = ()) -> None:
+    """Raise InputError where a header declares what no honest file has; names the file and what is allowed.
+
+    draws_on : files that it may draw on beside those in its folder.
+    """
     _check_bands(dataset, path)
     _check_nodata(dataset, path)
     _check_size(dataset, path)
     _check_place(dataset, path)
     _check_tile(dataset, str(path))
     _check_length(dataset, path)
-    _check_parts(dataset, path)
+    _check_parts(dataset, path, draws_on)
 
 
 def _check_bands(dataset: Any, path: Path) -> None:
@@ -157,14 +160,15 @@ def _check_length(dataset: Any, path: Path) -> None:
         )
 
 
-def _check_parts(dataset: Any, path: Path) -> None:
+def _check_parts(dataset: Any, path: Path, draws_on: Sequence[Path]) -> None:
     """Overviews and masks, inside and beside the file, are held to the same rules."""
     elsewhere = dataset.tags(ns="OVERVIEWS").get("OVERVIEW_FILE")
     if elsewhere is not None:
         raise InputError(f"{path} has its overviews in {elsewhere}; allowed is {path.name}.ovr")
     beside = [Path(file) for file in dataset.files[1:]]
+    allowed = {file.resolve() for file in draws_on}
     for file in beside:
-        if file.parent != path.parent:
+        if file.parent != path.parent and file.resolve() not in allowed:
             raise InputError(f"{path} draws on {file}; allowed are files beside it")
     parts = [(file, PARTS[file.suffix.lower()]) for file in beside if file.suffix.lower() in PARTS]
     if dataset.driver == "GTiff" and (dataset.overviews(1) or MaskFlags.per_dataset in dataset.mask_flag_enums[0]):

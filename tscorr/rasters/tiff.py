@@ -74,6 +74,14 @@ class Layout:
         planes = np.arange(self.planes)[:, None, None] * (down * right)
         return planes + np.arange(top, bottom)[:, None] * right + np.arange(left, last)
 
+    def nonzero(self, shape: tuple[int, ...], values: Array) -> Array:
+        """Which tiles (planes, rows, cols), of that shape, of a block (bands, rows, cols) hold anything but 0."""
+        _, down, right = shape
+        rows, cols = (np.arange(count) * size for count, size in zip((down, right), self.tile, strict=True))
+        by_row = np.logical_or.reduceat(values != 0, rows, axis=1)
+        found = np.logical_or.reduceat(by_row, cols, axis=2)
+        return found if self.planes > 1 else np.logical_or.reduce(found, axis=0, keepdims=True)
+
 
 def octets(values: Array) -> memoryview:
     """The bytes of a contiguous array."""

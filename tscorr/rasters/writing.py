@@ -35,6 +35,7 @@ class Writer:
 
     def __init__(self, path: Path, profile: dict[str, Any], like: RasterInfo, layer: "Layer") -> None:
         self.path = path
+        self._sparse = layer.sparse
         self._lock = threading.Lock()
         self._written: list[Stretch] = []
         self._sample: tuple[Block, int] | None = None
@@ -71,9 +72,14 @@ class Writer:
 
     def write(self, block: Block, values: Array) -> None:
         """Write a block of whole tiles (bands, rows, cols)."""
-        numbers = self._layout.numbers(block).ravel()
+        numbers = self._layout.numbers(block)
+        used = self._layout.nonzero(numbers.shape, values).ravel() if self._sparse else np.ones(numbers.size, np.bool_)
+        if not used.any():
+            return
+        numbers = numbers.ravel()[used]
         try:
-            with self._encoder(values) as tiles:
+            with self._encoder(values) as encoded:
+                tiles = encoded if used.all() else encoded.of(used)
                 with self._lock:
                     start, self._end = self._end, self._end + len(tiles.data)
                     self._sample = self._sample or (block, checksum(np.ascontiguousarray(values).data))
@@ -94,7 +100,7 @@ class Writer:
         try:
             for words, numbers in zip(self._places, (self._offsets, self._sizes), strict=True):
                 write_at(self._file, tiff.octets(numbers.astype(words.dtype)), words.start)
-            whole = bool(self._sizes.all()) and all(
+            whole = (self._sparse or bool(self._sizes.all())) and all(
                 checksum(read_at(self._file, stretch)) == stretch.checksum for stretch in self._written
             )
         except OSError as error:
@@ -106,9 +112,10 @@ class Writer:
 
     def _is_read_by_gdal(self) -> bool:
         """Whether a block comes out of the file as it went in: the header is whole too."""
-        if self._sample is None:
+        if self._sample is None and not self._sparse:
             return False
-        block, expected = self._sample
+        zeros = np.zeros(0, np.uint8)
+        block, expected = self._sample or (Block(0, 0, 0, 0), checksum(zeros))
         try:
             with rasterio.Env(**ENVIRONMENT), rasterio.open(self.path, sharing=False) as dataset:
                 return checksum(dataset.read(window=block.window).data) == expected
@@ -179,6 +186,8 @@ class Layer:
     units: tuple[str, ...] | None = None
     of_image: bool = False
     """the bands are those of the image: their tags are copied"""
+    sparse: bool = False
+    """blocks need not be written where all is 0, and tiles of zeros are not stored"""
     tags: Mapping[str, str] = field(default_factory=dict)
     palette: Array | None = None
     """red, green, blue of each value that the type can hold: uint8 (values, 3)"""

@@ -80,7 +80,7 @@ def correct_block(
         reflectance = stored * rules.scale[:, None, None] + rules.offset[:, None, None]
         extras.sigma[:] = np.where(missing, np.nan, _noise(reflectance, extras.noise[:, :, None, None]))
 
-    flags &= np.where(missing | ~table.peak[material], bits.QUALITY, bits.ON_ENTRY)
+    flags &= np.where(missing | ~table.peak[material], bits.DOUBT, bits.ON_ENTRY)
     flags[missing] |= bits.NODATA | bits.NOT_ASSESSED
     flags[~missing & (material == 0)] |= bits.NO_MATERIAL | bits.NOT_ASSESSED
     flags[~missing & full.any(axis=0)] |= bits.SATURATED
@@ -118,10 +118,11 @@ def correct_block(
             f[(take & (of_removed > np.maximum(reflectance - amount, 0) / 2)).any(axis=0)] |= bits.UNCERTAIN
         new, clipped = _subtract(values, amount, rules, None if extras is None else extras.highest[0])
         f[(take & clipped).any(axis=0)] |= bits.CLIPPED
-        new = np.where(take, new, values).astype(image.dtype)
-        image[all_bands] = new
+        taken = np.where(take, values - new, 0)
+        taken = taken.astype(image.dtype) if image.dtype.kind == "f" else taken
+        image[all_bands] = values - taken
         if removed.shape[1]:
-            removed[all_bands] = values - new
+            removed[all_bands] = taken
         if table.ways[q] & bits.BLANK:
             blank = (slice(None), where[0][over], where[1][over])
             image[blank] = rules.nodata[0]
@@ -131,7 +132,7 @@ def correct_block(
 
         tally.states[q] += np.bincount((f >> 6) & 3, minlength=4)
         tallied = (first_row + where[0]) % stride == 0
-        taken = (values - new) * rules.scale[:, None]
+        taken = taken * rules.scale[:, None]
         _tally(tally, pixels, np.asarray(hit), tallied, share, taken, bool(table.ways[q] & bits.SIMPLIFIED))
 
 

@@ -21,6 +21,7 @@ from tscorr.grid import Block, Grid, longitude_latitude
 from tscorr.report import SceneFacts, page, summary, write_json
 from tscorr.scene.pictures import PICTURE_PX, draw_quicklook
 from tscorr.scene.plan import Scene
+from tscorr.scene.products import written_products
 from tscorr.scene.run import Pipeline, Progress, Sums, silent
 from tscorr.scene.styles import flag_style
 from tscorr.scene.truth import coverage, residual_glare
@@ -110,7 +111,7 @@ def finish(
     if "flags" in scene.config.output.products:
         style = flag_style(np.flatnonzero(sums.flags).tolist())
         (folder / "flags.qml").write_text(style, encoding="utf-8")
-    corrected = rasters.result(folder, "corrected")
+    corrected = rasters.result(folder, "corrected", scene.image)
     if corrected is not None and (residual := residual_glare(scene, corrected)) is not None:
         report["residual_glare"] = residual
     if scene.bad_names:
@@ -235,7 +236,8 @@ def stac_item(scene: Scene, folder: Path, facts: SceneFacts, report: Mapping[str
 
 def _results(scene: Scene, folder: Path) -> dict[str, rasters.RasterInfo]:
     """The rasters written, by product."""
-    found = {product: rasters.result(folder, product) for product in sorted(scene.config.output.products)}
+    products = {*scene.config.output.products, *written_products(scene)}
+    found = {product: rasters.result(folder, product, scene.image) for product in sorted(products)}
     return {product: info for product, info in found.items() if info is not None}
 
 

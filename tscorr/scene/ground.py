@@ -1,5 +1,6 @@
 """The ground of a scene: its surface, and what is in shadow or hidden, over the pixels of the image."""
 
+import threading
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from functools import partial
@@ -41,8 +42,10 @@ class Ground:
         self._files = ExitStack()
         self._heights = self._heights_reader()
         self._shared = rasters.KeptReader(self._heights) if self._heights is not None else None
-        self._level_m, self._relief_m, self._noise_m = self._survey()
-        self.surface: Surface = self._surface()
+        self._lock = threading.Lock()
+        self._known_surface: Surface | None = None
+        self._relief_m = 0.0
+        self._rows: tuple[int, int] | None = None
         self._lit: BitMask | None = None
         self._seen: BitMask | None = None
 
@@ -71,6 +74,15 @@ class Ground:
         assert self._shared is not None
         return self._shared.read(block)
 
+    @property
+    def surface(self) -> Surface:
+        """The surface; its heights are surveyed when it is first asked for."""
+        with self._lock:
+            if self._known_surface is None:
+                level_m, self._relief_m, noise_m = self._survey()
+                self._known_surface = self._surface(level_m, noise_m)
+            return self._known_surface
+
     def _survey(self) -> tuple[float, float, float]:
         """Middle height, relief and noise of the surface, from windows spread over the scene. [m]"""
         if self._heights is None:
@@ -94,20 +106,19 @@ class Ground:
         noise = float(np.median([height_noise(window) for window in windows]))
         return float(np.median(heights)), float(np.ptp(heights)), noise
 
-    def _surface(self) -> Surface:
+    def _surface(self, level_m: float, noise_m: float) -> Surface:
         settings = self._scene.settings.surface
         cell_x_m, cell_y_m = self._scene.grid.cell_size
         if isinstance(settings, config.FlatSettings):
             return FlatSurface(settings.height_m)
-        level = self._level_m
         if isinstance(settings, config.DsmSettings) and settings.kind == "roof_planes":
             return RoofPlaneSurface(
-                self._shared_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level, noise_m=self._noise_m
+                self._shared_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level_m, noise_m=noise_m
             )
         dsm: Surface = FlatSurface(0.0)
         if self._heights is not None:
             dsm = DsmSurface(
-                self._shared_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level, noise_m=self._noise_m
+                self._shared_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level_m, noise_m=noise_m
             )
         if isinstance(settings, config.DsmSettings):
             return dsm
@@ -120,12 +131,19 @@ class Ground:
         )
         return GivenNormals(normals.read, dsm)
 
-    def prepare(self, masks: Path | None = None) -> None:
+    @property
+    def is_swept(self) -> bool:
+        """Whether there is a surface model to find shadows in, and they are wanted."""
+        return self._heights is not None and self._scene.settings.shadows
+
+    def prepare(self, masks: Path | None = None, rows: tuple[int, int] | None = None) -> None:
         """Find what is in shadow and what is hidden, once, before the first block is asked for.
 
         masks : a folder that `save` wrote to; what it wrote is taken from there.
+        rows  : first and last + 1 of those that will be asked for; all if not given. A sweep starts where the light
+                comes from, whatever is asked for, since a tower there may shade it, and goes on as far as needed.
         """
-        if self._heights is None or not self._scene.settings.shadows:
+        if not self.is_swept:
             return
         if masks is not None:
             self._lit, self._seen = (
@@ -133,6 +151,8 @@ class Ground:
                 for name in (LIT, SEEN)
             )
             return
+        assert self.surface is not None  # surveyed: the sweeps want its relief
+        self._rows = rows
         self._lit = self._swept(lambda **scene: shadows.DirectionSweep(direction=self._sun(), **scene), self._sun())
         self._seen = self._seen_mask()
 
@@ -170,7 +190,8 @@ class Ground:
         margin = self._margin(direction)
         mask = BitMask((rows, cols))
         sweep = sweep_of(shape=(rows + 2 * margin, cols + 2 * margin), cell_x_m=cell_x_m, cell_y_m=cell_y_m)
-        for strip in sweep.strips(STRIP_ROWS):
+        first, last = self._rows or (0, rows)
+        for strip in sweep.strips(STRIP_ROWS, (first + margin - 1, last + margin + 1)):
             block = Block(strip.row - margin, strip.col - margin, strip.height, strip.width)
             mask.narrow(block, sweep(strip, self._read_heights(block)))
         return mask
@@ -211,7 +232,7 @@ class Ground:
         A pixel beside a visible one counts as seen: the surface model is unsure by a pixel, and the image has a
         value there. Only the `needed` pixels are asked for where every pixel costs a ray.
         """
-        if self._heights is None or not self._scene.settings.shadows:
+        if not self.is_swept:
             return None
         around = block.padded(1)
         seen = (

@@ -36,7 +36,7 @@ def overlaps(results: Sequence[tuple[Scene, Path]]) -> list[Overlap]:
 
     Scenes of other bands, or whose results lack the image or the flags, are not compared.
     """
-    whole = [(scene, folder) for scene, folder in results if _layers(folder) is not None]
+    whole = [(scene, folder) for scene, folder in results if _layers(scene, folder) is not None]
     shared = [
         (region, one, two)
         for one, two in combinations(whole, 2)
@@ -48,8 +48,8 @@ def overlaps(results: Sequence[tuple[Scene, Path]]) -> list[Overlap]:
     return [difference(one, two, region) for region, one, two in shared[:MOST_PAIRS]]
 
 
-def _layers(folder: Path) -> tuple[rasters.RasterInfo, rasters.RasterInfo] | None:
-    corrected, flags = (rasters.result(folder, product) for product in ("corrected", "flags"))
+def _layers(scene: Scene, folder: Path) -> tuple[rasters.RasterInfo, rasters.RasterInfo] | None:
+    corrected, flags = (rasters.result(folder, product, scene.image) for product in ("corrected", "flags"))
     return None if corrected is None or flags is None else (corrected, flags)
 
 
@@ -131,7 +131,7 @@ class _Seen:
     """The layers of one scene, laid over a grid."""
 
     def __init__(self, scene: Scene, folder: Path, grid: Grid, files: ExitStack) -> None:
-        layers = _layers(folder)
+        layers = _layers(scene, folder)
         if layers is None:
             raise InputError(f"{folder} holds no corrected image and flags to compare")
         corrected, flags = layers

@@ -29,7 +29,7 @@ def draw_quicklook(scene: "Scene", folder: Path) -> Path:
     wavelengths = _good(scene.wavelengths_um, image)
     matrix = quicklook.rgb_matrix(wavelengths, image.fwhm_um)
     used = quicklook.used_bands(matrix)
-    result = rasters.result(folder, "corrected") or image
+    result = rasters.result(folder, "corrected", image) or image
     scale, offset = scene.stored.scale, scene.stored.offset
     before, after = (
         quicklook.linear_rgb(_reflectance(info, used, scale, offset, PICTURE_PX), matrix[used])

@@ -149,6 +149,7 @@ def plan_scene(
     seen = checks(view_of, settings.view, image)
     surface_files = checks(_surface_files, settings.surface, image)
     checks.settle()
+    checks(_check_difference, whole, image, stored)
     names = list(dict.fromkeys(whole.materials.classes.values()))
     materials = tuple(
         (
@@ -205,6 +206,15 @@ class Checks:
             kinds = {type(error) for error in self._errors}
             kind = kinds.pop() if len(kinds) == 1 else InputError
             raise kind("\n".join(dict.fromkeys(map(str, self._errors))))
+
+
+def _check_difference(whole: config.Config, image: rasters.RasterInfo, stored: Stored) -> None:
+    """The image less what was removed must hold the same nodata as the image."""
+    if whole.output.corrected == "vrt" and not rasters.expressible(image, stored.nodata):
+        raise ConfigError(
+            f"output.corrected = 'vrt' cannot keep the nodata value {stored.nodata:g} of the floating-point image "
+            f"{image.path}: what is removed may have that value too; allowed is 'file'"
+        )
 
 
 def _image(settings: config.Scene) -> rasters.RasterInfo:

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +13,26 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
-from tscorr import __version__, rasters
+from tscorr import rasters
 from tscorr.angles import angle_between, facet_angles, true_azimuth, zenith_azimuth
 from tscorr.correction import (
     SINGLE_FLAGS,
     BlockInputs,
     BlockResult,
     Corrector,
+    add_angles,
     add_tally,
     class_rows,
     new_tally,
 )
-from tscorr.correction.covariance import ORIGINS, origin
 from tscorr.correction.edges import ShadowByBrightness
 from tscorr.correction.sigmas import SigmaTally
 from tscorr.grid import Block, blocks, north_of
-from tscorr.quicklook import flag_palette
 from tscorr.scene.bad_bands import BadBands
 from tscorr.scene.ground import Ground
 from tscorr.scene.plan import Scene
+from tscorr.scene.products import ANGLE_NAMES, write_corrected_vrt, writer_of, written_products
+from tscorr.scene.skipping import SHADOW_OR_NODATA, Idle, Skipping, tallied
 from tscorr.width import lobe_shapes, width_table
 
 Array = NDArray[Any]
@@ -55,19 +55,6 @@ GEOMETRY_BYTES = 60
 """vectors, angles and masks of a pixel"""
 MOST_WORKERS = 4
 LEAST_CONFIDENCE = 0.5
-ANGLE_NAMES = (
-    "incidence",
-    "exitance",
-    "relative_azimuth",
-    "facet_tilt",
-    "local_angle",
-    "solar_zenith",
-    "solar_azimuth",
-    "view_zenith",
-    "view_azimuth",
-)
-
-
 ANGLES_OF_SUN = {"incidence", "solar_zenith", "solar_azimuth"}
 
 
@@ -165,7 +152,8 @@ class Pipeline:
         self.folder = folder
         self._strip = strip
         self._masks = masks
-        self._products = set(scene.config.output.products)
+        self._products = written_products(scene)
+        self._as_difference = scene.config.output.corrected == "vrt"
         self._weighted = scene.confidence is not None and scene.config.correction.weigh_by_confidence
         self.corrector = Corrector(
             scene.materials,
@@ -178,6 +166,7 @@ class Pipeline:
         self.bad_bands = BadBands(scene.image.bad_bands)
         self._by_brightness = ShadowByBrightness.of(scene.materials, scene.stored, scene.wavelengths_um)
         self.sums = Sums(len(scene.materials), scene.image.bands)
+        self._skipping = Skipping(scene, self.corrector.peaks)
         self._north = north_of(scene.grid)
         self._tables = [
             width_table(shapes[len(shapes) // 2], rules.form) if peak else None
@@ -200,10 +189,9 @@ class Pipeline:
         scene = self.scene
         with ExitStack() as files:
             self.open(files)
-            if self.corrector.peaks.any():
-                with self.sums.timed("geometry"):
-                    self.ground.prepare(self._masks)
-            self.writers = {name: self._writer(name) for name in sorted(self._products)}
+            with self.sums.timed("geometry"):
+                self._prepare()
+            self.writers = {name: writer_of(scene, self.folder, name, self._strip) for name in sorted(self._products)}
             try:
                 run_all(self.block, units_of(scene, self._strip), workers_of(scene), progress)
             except BaseException:
@@ -212,28 +200,48 @@ class Pipeline:
                 raise
             with self.sums.timed("write"), ThreadPoolExecutor(workers_of(scene)) as pool:
                 list(pool.map(self._close, self.writers.items()))
+            if self._as_difference and self._strip is None:
+                write_corrected_vrt(scene, self.folder)
 
-    def _close(self, product: tuple[str, rasters.Writer]) -> None:
+    def _close(self, product: tuple[str, rasters.Writer | rasters.EnviWriter]) -> None:
         """Close and check one raster; make it what was asked for."""
         name, writer = product
         writer.close()
         if self.scene.config.output.format == "cog":
             rasters.make_cog(writer.path, Resampling.nearest if name == "flags" else Resampling.average)
 
+    def _prepare(self) -> None:
+        """Sweep the surface for shadows and hidden ground, where a material with a peak is anywhere."""
+        if self._masks is not None:
+            self.ground.prepare(self._masks)
+        elif self.ground.is_swept and self.corrector.peaks.any():
+            rows = self._skipping.specular_rows(self.classes)
+            if rows is not None:
+                self.ground.prepare(rows=rows)
+
     def block(self, block: Block) -> int:
         """Read, correct and write one block; the number of its pixels."""
         with self.sums.timed("read"):
             rows = class_rows(self.classes.read(block, 1), self.scene.rows)
-            image = self.image.read(block)
-            bad = self.bad_bands.set_aside(image)
+            unread = self._as_difference and not self._skipping.flags_need_image
+            image, bad = (None, None) if unread else self._read_image(block)
         needed = self.corrector.peaks[rows]
-        skipped = None if needed.any() else "blocks_no_specular_material"
         with self.sums.timed("geometry"):
-            inputs, unseen = self.inputs(block, image, rows, needed)
-        layers = self._angle_layers(block, inputs, unseen)
-        with self.sums.timed("kernel"):
-            result = self.corrector(inputs, first_row=block.row, want_removed="removed" in self._products)
-        self.bad_bands.put_back(result.corrected, bad)
+            idle = self._skipping.idle(block, rows, needed, image)
+            shade = self.ground.shadowed(block) if idle is None and needed.any() else None
+            dark = self._skipping.is_dark(needed, shade)
+        if image is None and idle is None and not dark:
+            with self.sums.timed("read"):
+                image, bad = self._read_image(block)
+        elif image is None:
+            image = np.empty((0, *block.shape), self.scene.image.dtype)
+        if idle is None:
+            result, layers = self._corrected(block, image, rows, needed, shade)
+        else:
+            result = self._passed_through(block, image, rows, idle)
+            layers = self._idle_layers(block)
+        if bad is not None:
+            self.bad_bands.put_back(result.corrected, bad)
         layers |= {"corrected": result.corrected, "flags": result.flags[None]}
         if result.removed is not None:
             layers["removed"] = result.removed
@@ -243,22 +251,75 @@ class Pipeline:
                 result.sigma[np.array(self.scene.image.bad_bands)] = np.nan
         with self.sums.timed("write"):
             for name, writer in self.writers.items():
-                writer.write(block if self._strip is None else block.below(-self._strip.row), layers[name])
-        self.sums.add(result, rows, skipped)
+                if name in layers:
+                    writer.write(block if self._strip is None else block.below(-self._strip.row), layers[name])
+        self.sums.add(result, rows, SHADOW_OR_NODATA if dark else None if idle is None else idle.reason)
         return rows.size
 
-    def inputs(self, block: Block, image: Array, rows: Array, needed: Array) -> tuple[BlockInputs, Array | None]:
-        """Directions and masks of a block; nothing of it is computed where no material has a peak.
+    def _idle_layers(self, block: Block) -> dict[str, Array]:
+        """What is written of a block in which nothing was looked for; a sparse raster needs no zeros."""
+        layers: dict[str, Array] = {}
+        if "azimuthal_width" in self.writers:
+            layers["azimuthal_width"] = np.full((1, *block.shape), np.nan, np.float32)
+        if isinstance(self.writers.get("removed"), rasters.EnviWriter):
+            layers["removed"] = np.zeros((self.scene.image.bands, *block.shape), self.scene.image.dtype)
+        return layers
 
+    def _read_image(self, block: Block) -> tuple[Array, Array]:
+        """The image of a block, its bad bands set aside, and those."""
+        image = self.image.read(block)
+        return image, self.bad_bands.set_aside(image)
+
+    def _corrected(
+        self, block: Block, image: Array, rows: Array, needed: Array, shade: tuple[Array, Array] | None
+    ) -> tuple[BlockResult, dict[str, Array]]:
+        """A block without its specular part, and the layers of angles and widths that are asked for."""
+        with self.sums.timed("geometry"):
+            inputs, unseen = self.inputs(block, image, rows, needed, shade)
+        layers = self._angle_layers(block, inputs, unseen)
+        with self.sums.timed("kernel"):
+            want_removed = "removed" in self._products and len(image) > 0
+            return self.corrector(inputs, first_row=block.row, want_removed=want_removed), layers
+
+    def _passed_through(self, block: Block, image: Array, rows: Array, idle: Idle) -> BlockResult:
+        """A block in which nothing is to be removed, as it is; with the statistics of its angles where it has some."""
+        with self.sums.timed("kernel"):
+            result = self.corrector.passed_through(self._without_geometry(block, image, rows))
+        if idle.attenuated is not None:
+            assessed = int(result.tally.states[self.corrector.peaks, 0].sum())
+            result.tally.out_of_lobe[0] += assessed
+            result.tally.attenuated[0] += assessed * idle.attenuated
+            for line in tallied(block, self.scene.tally_stride):
+                window = slice(line.row - block.row, line.row - block.row + line.height)
+                here = rows[window]
+                inputs, _ = self.inputs(line, image[:, window], here, self.corrector.peaks[here])
+                tally = self.corrector(inputs, first_row=line.row, want_removed=False).tally
+                add_angles(result.tally, tally)
+        return result
+
+    def _without_geometry(self, block: Block, image: Array, rows: Array) -> BlockInputs:
+        up = np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1)
+        return BlockInputs(
+            image=image,
+            material=rows,
+            sun=up,
+            view=up,
+            normal=up,
+            low_confidence=_doubtful(self._class_confidence(block)),
+        )
+
+    def inputs(
+        self, block: Block, image: Array, rows: Array, needed: Array, shade: tuple[Array, Array] | None = None
+    ) -> tuple[BlockInputs, Array | None]:
+        """Directions and masks of a block.
+
+        shade : what the ground says of shadow, and where that is unsure; where not given, it is asked.
         And where no sensor is known to have looked: bool (rows, cols), or None where that is nowhere.
         """
         scene = self.scene
+        if shade is None and needed.any():
+            shade = self.ground.shadowed(block)
         confidence = self._class_confidence(block)
-        doubtful = None if confidence is None else ~(confidence >= LEAST_CONFIDENCE)
-        if not needed.any() and "angles" not in self._products:
-            up = np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1)
-            inputs = BlockInputs(image=image, material=rows, sun=up, view=up, normal=up, low_confidence=doubtful)
-            return inputs, None
         view, seconds, unseen = scene.view.look(scene.grid, block, self.ground.surface.heights(block))
         sun = scene.sun.vectors(block, seconds)
         normal, unreliable = self.ground.surface.normals(block)
@@ -269,10 +330,10 @@ class Pipeline:
             sun=sun,
             view=view,
             normal=normal,
-            shadowed=self._shadowed(block, image, rows, needed, sun, normal),
+            shadowed=self._shadowed(shade, image, rows, needed, sun, normal),
             hidden=unseen if hidden is None else hidden if unseen is None else hidden | unseen,
             unreliable=unreliable,
-            low_confidence=doubtful,
+            low_confidence=_doubtful(confidence),
             weight=_weight(confidence) if self._weighted and confidence is not None else None,
             normal_sigma_deg=self.ground.surface.normal_sigma_deg(block) if self._scatters else None,
         )
@@ -292,13 +353,18 @@ class Pipeline:
         return confidence
 
     def _shadowed(
-        self, block: Block, image: Array, rows: Array, needed: Array, sun: Array, normal: Array
+        self,
+        shade: tuple[Array, Array] | None,
+        image: Array,
+        rows: Array,
+        needed: Array,
+        sun: Array,
+        normal: Array,
     ) -> Array | None:
         """Where the sun is hidden: as the surface model says, and at the rim of a shadow as the image says."""
-        found = self.ground.shadowed(block) if needed.any() else None
-        if found is None:
+        if shade is None:
             return None
-        shadowed, unsure = found
+        shadowed, unsure = shade
         return self._by_brightness.settle(shadowed, unsure & needed, image, rows, sun, normal)
 
     def _angle_layers(self, block: Block, inputs: BlockInputs, unseen: Array | None) -> dict[str, Array]:
@@ -333,66 +399,15 @@ class Pipeline:
                     widths[mine] = table.at(incidence[mine])
         return widths
 
-    def _writer(self, name: str) -> rasters.Writer | rasters.EnviWriter:
-        image, stored = self.scene.image, self.scene.stored
-        tags = {"TSCORR_VERSION": __version__, "TSCORR_SCENE": self.scene.name, "TSCORR_PRODUCT": name}
-        profile = dict(image.profile)
-        if (codec := self.scene.config.output.compression) is not None:
-            profile["compress"] = codec
-        like_image = rasters.Layer(
-            names=image.names,
-            dtype=image.dtype.name,
-            nodata=stored.nodata,
-            scales=image.scales,
-            offsets=image.offsets,
-            of_image=True,
-            tags=tags,
-        )
-        angles = rasters.Layer(
-            names=ANGLE_NAMES, dtype="float32", nodata=float("nan"), units=("degree",) * 9, tags=tags
-        )
-        origins = "; ".join(
-            f"{surface.name}: {ORIGINS[origin(surface, rules.material_covariance)]}"
-            for surface, _, rules in self.scene.materials
-            if surface.has_peak
-        )
-        layers = {
-            "corrected": like_image,
-            "removed": replace(
-                like_image, dtype=self.corrector.removed_type.name, nodata=None, offsets=(0.0,) * image.bands
-            ),
-            "uncertainty": replace(
-                like_image,
-                dtype="float32",
-                nodata=float("nan"),
-                scales=None,
-                tags={**tags, "QUANTITY": "1 sigma of the corrected reflectance factor", "TSCORR_COVARIANCE": origins},
-            ),
-            "flags": rasters.Layer(
-                names=("flags",), dtype="uint16", tags={**tags, **FLAG_TAGS}, palette=flag_palette()
-            ),
-            "azimuthal_width": replace(angles, names=("azimuthal width",), units=("degree",)),
-            "angles": angles,
-        }
-        if not layers[name].of_image:
-            profile |= FASTER_CODEC.get(profile["compress"], {})
-        like = image if self._strip is None else image.crop(self._strip)
-        if self.scene.config.output.format == "envi":
-            return rasters.EnviWriter(self.folder / f"{name}{rasters.ENVI_SUFFIX}", like, layers[name])
-        return rasters.Writer(self.folder / f"{name}.tif", profile, like, layers[name])
+
+def _doubtful(confidence: Array | None) -> Array | None:
+    """Where the class is not known to be more likely right than wrong, or None where nobody says."""
+    return None if confidence is None else ~(confidence >= LEAST_CONFIDENCE)
 
 
 def _weight(confidence: Array) -> Array:
     """The part of a pixel that is its material: as sure as its class is; all of it where that is not known."""
     return np.where(np.isnan(confidence), 1, np.clip(confidence, 0, 1)).astype(np.float32)
-
-
-FASTER_CODEC: dict[str, dict[str, Any]] = {"none": {"compress": "zstd"}, "deflate": {"zlevel": 1}}
-"""for layers that no image set an example for, by the image's codec: flags become small by any, and fast by these"""
-
-FLAG_TAGS = {f"FLAG_BIT_{flag.value.bit_length() - 1}": str(flag.name) for flag in SINGLE_FLAGS} | {
-    "FLAG_BITS_6_7": "SPECULAR_STATE: 0 negligible, 1 corrected, 2 uncorrectable, 3 not assessed"
-}
 
 
 def workers_of(scene: Scene) -> int:

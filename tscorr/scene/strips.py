@@ -27,6 +27,7 @@ from tscorr.grid import Block, blocks
 from tscorr.scene.correct import check_unchanged, finish, peak_rss_mb, resume_key, target_of
 from tscorr.scene.ground import Ground
 from tscorr.scene.plan import Scene
+from tscorr.scene.products import write_corrected_vrt, written_products
 from tscorr.scene.run import Pipeline, Progress, Sums, silent, units
 
 MASKS, SUMS = "masks", "sums.json"
@@ -133,11 +134,13 @@ def join(strips: Strips, wall_s: float) -> dict[str, Any]:
         sums = Sums(len(scene.materials), scene.image.bands)
         for part in parts:
             add_sums(sums, json.loads((part / SUMS).read_text(encoding="utf-8")))
-        for product in scene.config.output.products:
+        for product in sorted(written_products(scene)):
             files = [publication.folder / f"{product}.{part.name}.tif" for part in parts]
             for part, file in zip(parts, files, strict=True):
                 _link(part / f"{product}.tif", file)
             rasters.join_rows(files, publication.folder / f"{product}.vrt")
+        if scene.config.output.corrected == "vrt":
+            write_corrected_vrt(scene, publication.folder)
         report = finish(scene, publication, hashes, sums, wall_s)
     shutil.rmtree(strips.folder, ignore_errors=True)
     return report

@@ -66,7 +66,7 @@ def coverage(scene: Scene, folder: Path) -> dict[str, Any] | None:
     """
     truth = scene.settings.truth
     names = ("corrected", "flags", "uncertainty")
-    known = [file for name in names if (file := rasters.result(folder, name)) is not None]
+    known = [file for name in names if (file := rasters.result(folder, name, scene.image)) is not None]
     if truth is None or len(known) < len(names):
         return None
     scale, offset = (np.array(values)[:, None, None] for values in (scene.stored.scale, scene.stored.offset))

@@ -9,12 +9,13 @@ from tscorr.sensor.layers import RasterView, angle_vectors, check_angles
 from tscorr.sensor.line import LineView
 from tscorr.sensor.obs import OBS_BANDS, Obs, check_obs, check_obs_slope
 from tscorr.sensor.trajectory import Trajectory, read_trajectory
-from tscorr.sensor.views import ConstantView, FrameView, Look, View, ground
+from tscorr.sensor.views import ConstantView, Fan, FrameView, Look, View, ground
 
 __all__ = [
     "OBS_BANDS",
     "Cameras",
     "ConstantView",
+    "Fan",
     "FrameView",
     "LineView",
     "Look",

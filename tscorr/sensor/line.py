@@ -11,7 +11,7 @@ from tscorr.angles import angle_between
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
 from tscorr.sensor.trajectory import Trajectory
-from tscorr.sensor.views import Look, View, ground, place, unit
+from tscorr.sensor.views import Fan, Look, View, ground, place, unit
 
 Array = NDArray[Any]
 
@@ -20,6 +20,8 @@ SWATH_ZENITH_DEG = 60.0
 SAME_DIRECTION_DEG = 1.0
 SAME_TIME_S = 60.0
 """two passes that agree to these are one: a scanner that yaws goes over a point several times"""
+ASIDE_CELLS, TURNED_DEG = 0.25, 0.2
+"""a trajectory whose samples lie no farther aside, and whose scan planes are turned no more, is straight"""
 LEAST_SEEN = 0.7
 """share of the scene that a trajectory must pass; image corners beyond a line's end hold no data"""
 SAMPLES = 9
@@ -108,8 +110,38 @@ class LineView(View):
         offset = path.table[:3].T - start
         aside = np.linalg.norm(offset - (offset @ along)[:, None] * along, axis=1)
         turned = np.rad2deg(np.linalg.norm(path.forward.T - along, axis=1))
-        is_straight = aside.max() < 0.25 * min(grid.cell_size) and turned.max() < 0.2
+        is_straight = aside.max() < ASIDE_CELLS * min(grid.cell_size) and turned.max() < TURNED_DEG
         return (start, end) if is_straight else None
+
+    def fan(self, grid: Grid) -> Fan | None:
+        """Where the trajectory is straight over the grid, the perpendiculars to it, and how far off they may be.
+
+        With scan planes turned by at most d and samples s apart, a perpendicular of length u is d (1 + s / u) off,
+        and asin(a / u) for samples that lie up to a aside. Patches that another part of the trajectory may pass, or
+        that reach beyond its ends, are not certain.
+        """
+        ends = self.straight(grid)
+        if ends is None:
+            return None
+        start, end = ends
+        along = (end - start) / np.linalg.norm(end - start)
+        path, over = self.path, self._over(grid)
+        step_m = float(np.linalg.norm(np.diff(over.table[:3]), axis=0).max())
+        aside_m = ASIDE_CELLS * min(grid.cell_size)
+
+        def bounds(x: Array, y: Array, height_m: float) -> tuple[Array, Array]:
+            points = np.stack([x, y, np.full_like(x, height_m)])
+            beside = start[:, None, None] - points
+            vectors = beside - along[:, None, None] * np.tensordot(along, beside, 1)
+            length = np.sqrt((vectors**2).sum(axis=0)).min(axis=0)
+            off_deg = TURNED_DEG * (1 + step_m / length) + np.rad2deg(np.arcsin(np.minimum(1, aside_m / length)))
+            candidates = path.seconds[self._candidates(*points)]
+            elsewhere = (candidates < over.seconds[0]) | (candidates >= over.seconds[-1])
+            first, last = (np.tensordot(over.table[3:, k], points - over.table[:3, k, None, None], 1) for k in (0, -1))
+            seen = ((first > 0) & (last <= 0)).all(axis=0) & ~elsewhere.any()
+            return vectors, np.where(seen, off_deg, np.nan)
+
+        return bounds
 
     def span(self, grid: Grid, height_m: float) -> tuple[float, float, float]:
         """When the first, the middle and the last point of a level grid were seen, in seconds of the trajectory.

@@ -1,5 +1,6 @@
 """What every view answers, and the two simplest: one direction, one projection centre."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -26,6 +27,15 @@ class Look(NamedTuple):
     unseen: Array | None = None
 
 
+Fan = Callable[[Array, Array, float], tuple[Array, Array]]
+"""Bounds on the directions that level patches of ground are seen in.
+
+Given x and y (corners, patches) and a height [m]: vectors (3, corners, patches), not of unit length, and angles
+(patches,) [deg]. Every view of a patch lies within that angle of the convex hull of its vectors; nan where it is
+not certain that all of a patch was seen.
+"""
+
+
 class View(Protocol):
     """How a scene was seen."""
 
@@ -47,6 +57,11 @@ class View(Protocol):
         del grid, block, heights
         return {}
 
+    def fan(self, grid: Grid) -> Fan | None:
+        """Bounds on the directions in which patches of a grid are seen, or None where there are none."""
+        del grid
+        return None
+
 
 @dataclass(frozen=True)
 class ConstantView(View):
@@ -66,6 +81,11 @@ class ConstantView(View):
 
     def check(self, grid: Grid, highest_m: float) -> None:
         """A constant view sees any grid."""
+
+    def fan(self, grid: Grid) -> Fan:
+        """The one vector."""
+        vector = self.look(grid, Block(0, 0, 1, 1), np.zeros((1, 1))).vectors
+        return lambda x, y, _: (np.broadcast_to(vector, (3, *x.shape)), np.zeros(y.shape[1:]))
 
 
 FARTHEST_OF_HEIGHT = 20
@@ -99,6 +119,15 @@ class FrameView(View):
                 f"the camera at {place(self.position)} is {away / 1000:.0f} km from the nearest corner of the scene, "
                 f"far too low to see it; allowed is a position in the CRS of the image, or in that of crs = ..."
             )
+
+    def fan(self, grid: Grid) -> Fan:
+        """Vectors of the corners: those between are sums of them."""
+        del grid
+        east, north, up = self.position
+        return lambda x, y, height_m: (
+            np.stack([east - x, north - y, np.full_like(x, up - height_m)]),
+            np.zeros(x.shape[1:]),
+        )
 
     def describe(self, grid: Grid, block: Block, heights: Array) -> dict[str, str]:
         """Where the camera stood."""

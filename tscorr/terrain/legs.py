@@ -43,6 +43,13 @@ class Axes(NamedTuple):
         line, pixel = self.vector(east, north)
         return (line + self.lines - 1 if self.backwards else line), pixel
 
+    def end(self, rows: tuple[int, int] | None) -> int:
+        """The line behind which none of these rows, first and last + 1, lies; all lines if not given."""
+        if rows is None or self.transposed:
+            return self.lines
+        first, last = rows
+        return min(max(self.lines - first if self.backwards else last, 0), self.lines)
+
     def next_multiple(self, line: int, step: int) -> int:
         """The next line after `line` at which a row or column number is a multiple of `step`, or the end."""
         if self.backwards:

@@ -64,19 +64,28 @@ class Sweep:
     """
 
     def __init__(self, legs: list[Leg], tolerance_m: float) -> None:
-        self._legs = [leg for leg in legs if leg.first < leg.axes.lines]
         self._tolerance_m = tolerance_m
+        self._begin(legs, None)
+
+    def _begin(self, legs: list[Leg], rows: tuple[int, int] | None) -> None:
+        """Set out on the legs that judge some of these rows."""
+        ends = [leg.axes.end(rows) for leg in legs]
+        self._legs = [leg for leg, end in zip(legs, ends, strict=True) if leg.first < end]
+        self._ends = [end for leg, end in zip(legs, ends, strict=True) if leg.first < end]
         self._next = (0, self._legs[0].first) if self._legs else None
 
-    def strips(self, lines: int) -> Iterator[Strip]:
+    def strips(self, lines: int, rows: tuple[int, int] | None = None) -> Iterator[Strip]:
         """The windows to read; none where nothing can be hidden.
 
         Each is `lines` rows or columns deep and lies between multiples of that, as the file's tiles do.
+        rows : first and last + 1 of those that are to be judged: a pass along columns ends behind them, for nothing
+               there hides them. All if not given.
         """
-        for index, leg in enumerate(self._legs):
+        self._begin(self._legs, rows)
+        for index, (leg, end) in enumerate(zip(self._legs, self._ends, strict=True)):
             first = leg.first
-            while first < leg.axes.lines:
-                stop = leg.axes.next_multiple(first, lines)
+            while first < end:
+                stop = min(leg.axes.next_multiple(first, lines), end)
                 low, high = leg.span(stop - 1)
                 line = leg.axes.lines - stop if leg.axes.backwards else first
                 if leg.axes.transposed:
@@ -116,7 +125,7 @@ class Sweep:
 
     def _after(self, leg: int, line: int) -> tuple[int, int] | None:
         """Leg and line that follow, or None at the end."""
-        if line < self._legs[leg].axes.lines:
+        if line < self._ends[leg]:
             return leg, line
         return (leg + 1, self._legs[leg + 1].first) if leg + 1 < len(self._legs) else None
 
