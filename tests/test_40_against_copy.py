@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rasterio._env import get_gdal_config
 
 from tscorr import rasters
+from tscorr.scene.run import Pipeline
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 import against_copy
@@ -80,3 +82,19 @@ def test_a_city_is_the_same_whatever_it_is_stored_as(tmp_path):
         with rasters.Reader(a) as first, rasters.Reader(b) as second:
             block = rasters.reading.Block(0, 0, 100, 150)
             np.testing.assert_array_equal(first.read(block), second.read(block))
+
+
+def test_the_cache_of_gdal_is_small_in_every_thread_of_a_run(tmp_path, monkeypatch):
+    image = city.make_city(tmp_path, 64, 64, tile=16)
+    sizes = set()
+    block = Pipeline.block
+
+    def looking(self, part):
+        sizes.add(get_gdal_config("GDAL_CACHEMAX"))
+        count = block(self, part)
+        sizes.add(get_gdal_config("GDAL_CACHEMAX"))
+        return count
+
+    monkeypatch.setattr(Pipeline, "block", looking)
+    against_copy.run(city.write_config(image, workers=2))
+    assert sizes == {32 << 20}  # not a twentieth of the machine's memory

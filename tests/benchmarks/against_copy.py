@@ -53,7 +53,7 @@ def gdal_copy(image):
     for key in ("crs", "transform", "driver"):
         options.pop(key)
     target = image.with_name("copy.tif")
-    with rasterio.Env(GDAL_SWATH_SIZE=2 * tile * row_bytes, GDAL_NUM_THREADS=2, GDAL_CACHEMAX=256):
+    with rasterio.Env(GDAL_SWATH_SIZE=2 * tile * row_bytes, GDAL_NUM_THREADS=2, GDAL_CACHEMAX=256 << 20):
         copy_raster(image, target, driver="GTiff", **options)
     target.unlink()
 

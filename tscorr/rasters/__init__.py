@@ -5,13 +5,23 @@ GDAL never applies scale and offset; neither does anything here: blocks hold sto
 
 from tscorr.rasters.difference import expressible, write_difference
 from tscorr.rasters.envi_writing import ENVI_SUFFIX, EnviWriter
-from tscorr.rasters.header import IMAGE_TYPES, RasterInfo, can_hold, check_metric, check_overlap, describe, opened
+from tscorr.rasters.header import (
+    ENVIRONMENT,
+    IMAGE_TYPES,
+    RasterInfo,
+    can_hold,
+    check_metric,
+    check_overlap,
+    describe,
+    opened,
+)
 from tscorr.rasters.joining import join_rows, result
 from tscorr.rasters.kept import KeptReader
 from tscorr.rasters.reading import Reader, read_decimated, read_decimated_flags, read_samples
 from tscorr.rasters.writing import Layer, Writer, make_cog
 
 __all__ = [
+    "ENVIRONMENT",
     "ENVI_SUFFIX",
     "IMAGE_TYPES",
     "EnviWriter",

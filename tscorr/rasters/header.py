@@ -20,7 +20,9 @@ from tscorr.rasters.sound import GDAL_ERRORS, check_sound, open_dataset
 IMAGE_TYPES = ("uint8", "int16", "uint16", "float32")
 TILE_BYTES = 8e6
 """what is stored together in new files at most"""
-ENVIRONMENT = {"GDAL_CACHEMAX": 64, "GDAL_NUM_THREADS": "1", "GDAL_VRT_ENABLE_PYTHON": "NO"}
+ENVIRONMENT = {"GDAL_CACHEMAX": 32 << 20, "GDAL_NUM_THREADS": "1", "GDAL_VRT_ENABLE_PYTHON": "NO"}
+"""options for GDAL; rasterio takes the size of its cache in bytes, whatever GDAL's manual says, and it is of the whole
+process: where nobody sets it around the reading of many blocks, it grows to a twentieth of the machine's memory"""
 
 
 @dataclass(frozen=True, slots=True)

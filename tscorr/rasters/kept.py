@@ -12,9 +12,9 @@ from tscorr.rasters.reading import Reader
 
 Array = NDArray[Any]
 
-PART_ROWS, PART_COLS = 512, 1024
+PART_ROWS, PART_COLS = 512, 512
 """about the size of a part, in whole tiles of the file where they are not larger"""
-KEPT_BYTES = 56e6
+KEPT_BYTES = 44e6
 """three rows of parts under a stripe of blocks: those above, under and below the blocks that are worked on"""
 
 
@@ -34,7 +34,7 @@ class KeptReader:
         self._lock = threading.Lock()
         tile_rows, tile_cols = reader.tile
         self._rows, self._cols = max(1, PART_ROWS // tile_rows) * tile_rows, max(1, PART_COLS // tile_cols) * tile_cols
-        if self._rows * self._cols > 4 * PART_ROWS * PART_COLS:  # strips of a wide raster, or enormous tiles
+        if self._rows * self._cols > 8 * PART_ROWS * PART_COLS:  # strips of a wide raster, or enormous tiles
             self._rows, self._cols = PART_ROWS, PART_COLS
         self._first_row, self._first_col = (-shift for shift in reader.shift)
 

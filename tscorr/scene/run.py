@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
@@ -46,8 +47,8 @@ def silent(pixels: int) -> None:
 
 
 UNIT_COLUMNS = 2048
-STRIPE_COLUMNS = 8192
-BASE_MB = 220
+STRIPE_COLUMNS = 6144
+BASE_MB = 380
 """memory of the process before the first block, and of what does not grow with blocks"""
 COPIES = 5
 """an image block and what is made of it, at most, in blocks of the image's own size"""
@@ -187,7 +188,7 @@ class Pipeline:
     def run(self, progress: Progress) -> None:
         """All blocks, by the workers of the configuration; the first error stops the rest."""
         scene = self.scene
-        with ExitStack() as files:
+        with rasterio.Env(**rasters.ENVIRONMENT), ExitStack() as files:
             self.open(files)
             with self.sums.timed("geometry"):
                 self._prepare()
