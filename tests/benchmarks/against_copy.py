@@ -20,12 +20,12 @@ from unittest import mock
 
 import numpy as np
 import rasterio
-from city import CELL_M, MATERIALS, Lattice, make_city, profile_of, write_config
+from city import CELL_M, Lattice, make_city, profile_of, write_config
 from measuring import Ratio, as_json, interleaved, peak_mb, ratio, table
 from rasterio.shutil import copy as copy_raster
 
 from tscorr import batch
-from tscorr.correction import BlockResult, class_rows, new_tally
+from tscorr.correction import class_rows
 from tscorr.scene import correct
 from tscorr.scene.run import Pipeline
 from tscorr.terrain import shadows
@@ -66,8 +66,6 @@ def copied_block(self, block):
     layers = {"corrected": image, "flags": rows.astype(np.uint16)[None]}
     for name, writer in self.writers.items():
         writer.write(block, layers[name])
-    tally = new_tally(len(MATERIALS) + 1, len(image))
-    self.sums.add(BlockResult(image, None, layers["flags"][0], tally), None)
     return rows.size
 
 
@@ -79,7 +77,7 @@ def unpublished():
             ("tscorr.publish.sha256", lambda *_: ""),
             ("tscorr.publish.os.fsync", lambda _: None),
             ("tscorr.rasters.writing.checksum", lambda _: 0),
-            ("tscorr.rasters.writing._read", lambda *_: b""),
+            ("tscorr.rasters.writing.read_at", lambda *_: b""),
         ):
             patches.enter_context(mock.patch(name, value))
         yield
