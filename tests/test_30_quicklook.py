@@ -44,6 +44,14 @@ def test_grey_of_18_percent_is_grey_0461(name):
     np.testing.assert_allclose(rgb, rgb[0, 0, 0], atol=1e-6)
 
 
+def test_a_picture_changes_nothing_about_how_arrays_are_printed():
+    script = (
+        "import numpy as np; before = np.get_printoptions(); from tscorr.quicklook import rgb_matrix; "
+        "rgb_matrix([0.45, 0.55, 0.65]); assert np.get_printoptions() == before, np.get_printoptions()"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
 def test_exposure_multiplies_linear_light():
     half = quicklook.true_colour(np.full((5, 1, 1), 0.18), DELFT_UM, exposure=0.5)
     full = quicklook.true_colour(np.full((5, 1, 1), 0.09), DELFT_UM)

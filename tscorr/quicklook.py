@@ -71,7 +71,8 @@ def _true_colour_matrix(centres_um: NDArray[np.float64], fwhm_um: NDArray[np.flo
     expanded to second order (van Cittert): 3 - 3 B + B^2. It undoes most of the blur, cannot amplify noise
     by more than 7 and keeps grey exactly grey.
     """
-    import colour
+    with np.printoptions():  # the package changes how numpy prints arrays, for everyone
+        import colour
 
     observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     illuminant = colour.SDS_ILLUMINANTS["D65"]
