@@ -171,7 +171,7 @@ def _describe(dataset: Any, layer: "Layer", like: RasterInfo) -> None:
     if layer.units is not None:
         dataset.units = layer.units
     if layer.palette is not None:
-        dataset.write_colormap(1, dict(enumerate(map(tuple, layer.palette.tolist()))))
+        dataset.write_colormap(1, dict(enumerate(zip(*layer.palette.T.tolist(), strict=True))))
 
 
 @dataclass(frozen=True, slots=True)

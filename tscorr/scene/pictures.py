@@ -1,6 +1,7 @@
 """Pictures of images: before and after the correction, and of one image alone."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,10 +32,12 @@ def draw_quicklook(scene: "Scene", folder: Path) -> Path:
     used = quicklook.used_bands(matrix)
     result = rasters.result(folder, "corrected", image) or image
     scale, offset = scene.stored.scale, scene.stored.offset
-    before, after = (
-        quicklook.linear_rgb(_reflectance(info, used, scale, offset, PICTURE_PX), matrix[used])
-        for info in (image, result)
-    )
+
+    def light(info: rasters.RasterInfo) -> Array:
+        return quicklook.linear_rgb(_reflectance(info, used, scale, offset, PICTURE_PX), matrix[used])
+
+    with ThreadPoolExecutor(2) as readers:  # to decode them is most of the work
+        before, after = readers.map(light, (image, result))
     path = folder / "quicklook.png"
     flag_file = rasters.result(folder, "flags")
     flags = np.zeros(before.shape[:2], np.uint16)
