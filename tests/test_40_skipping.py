@@ -28,6 +28,7 @@ from tscorr import batch
 from tscorr.config import load_config
 from tscorr.rasters import Reader
 from tscorr.scene.correct import correct_scene
+from tscorr.scene.forecast import forecast
 
 EVERYTHING = ["corrected", "flags", "removed", "azimuthal_width", "angles"]
 ALL_SKIPPED = "blocks_no_specular_material", "blocks_out_of_reach", "blocks_shadow_or_nodata"
@@ -252,3 +253,34 @@ def test_random_scenes_are_skipped_in_every_way(tmp_path):
             total[key] += report["skipped"][key]
     assert min(total.values()) > 0, total
     assert sum(total.values()) >= 6
+
+
+def thresholds(config):
+    """Shares of pixels and blocks by threshold, as `tscorr plan` says."""
+    (scene,) = batch.plan(load_config(config))
+    rows = forecast(scene)["negligible"]
+    assert [row["negligible_reflectance"] for row in rows] == sorted(row["negligible_reflectance"] for row in rows)
+    return {row["negligible_reflectance"]: (row["pixels"], row["blocks"]) for row in rows}
+
+
+@pytest.mark.parametrize("negligible", [5e-5, 1e-3, 0.9])
+def test_the_plan_says_what_a_threshold_would_skip(tmp_path, negligible):
+    """On flat ground the sample sees all of a small scene; the run then does just that."""
+    write_inputs(tmp_path)
+    scene = {**STEEP, "view": {"kind": "constant", "zenith_deg": 30.0, "azimuth_deg": 0.0}}
+    config = write_config(tmp_path, scene, correction={"negligible_reflectance": negligible})
+    pixels, blocks = thresholds(config)[negligible]
+    report, rasters = run(config)
+    assert pixels == np.mean(~rasters["removed"].any(axis=0))
+    assert blocks == report["skipped"]["blocks_out_of_reach"]
+    assert 0 < pixels < 1 or negligible == 0.9
+
+
+def test_the_plan_of_a_surface_model_looks_at_its_slopes(tmp_path):
+    """The gable turns half of the metal away from the camera, and half of it more into the peak or out of it."""
+    write_inputs(tmp_path)
+    flat = thresholds(write_config(tmp_path, {"surface": {"kind": "flat"}}, **METAL_ONLY))
+    sloped = thresholds(write_config(tmp_path, **METAL_ONLY))
+    assert flat[1e-3][0] == np.mean(class_map() != METAL)
+    assert sloped[5e-3][0] > flat[5e-3][0]
+    assert sloped[5e-5][1] == 0

@@ -140,6 +140,12 @@ def plan(config: Path, as_json: bool) -> None:
         click.echo(
             f"  {skipped}; at most {entry['disk_mb']:.0f} MB on disk, about {entry['memory_mb']:.0f} MB of memory"
         )
+        for row in entry["negligible"]:
+            click.echo(
+                f"  negligible_reflectance = {row['negligible_reflectance']:.2g}{' (as set)' if row['set'] else ''}: "
+                f"nothing to remove in about {100 * row['pixels']:.1f} % of the pixels, {100 * row['blocks']:.0f} % "
+                f"of the blocks"
+            )
         click.echo(f"  {'current: nothing to do' if entry['current'] else 'to be computed'}")
 
 

@@ -1,14 +1,19 @@
 """What a scene would cost and skip: the content of `tscorr plan`."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tscorr.correction import Corrector, class_rows
 from tscorr.scene.correct import is_current, view_samples
 from tscorr.scene.plan import Scene
+from tscorr.scene.products import written_products
 from tscorr.scene.run import BASE_MB, pixel_bytes, units_of, work_bytes, workers_of
+from tscorr.scene.thresholds import by_threshold
+
+if TYPE_CHECKING:
+    from tscorr.grid import Block
 
 PRODUCT_BYTES = {"flags": 2, "azimuthal_width": 4, "angles": 36}
 OVERVIEWS = 4 / 3
@@ -18,16 +23,16 @@ BESIDE_BYTES = 3e6
 
 
 def forecast(scene: Scene) -> dict[str, Any]:
-    """Shares of the materials, blocks with nothing to correct, disk and memory; reads the class map only."""
+    """Shares of the materials, blocks with nothing to correct, disk and memory; reads the class map and samples."""
     peaks = Corrector(scene.materials, scene.stored).peaks
     counts = np.zeros(len(scene.materials) + 1, np.int64)
     cut = units_of(scene)
-    idle = 0
+    present: dict[Block, list[int]] = {}
     with scene.classes() as classes:
         for block in cut:
             in_block = np.bincount(class_rows(classes.read(block, 1), scene.rows).ravel(), minlength=len(counts))
             counts += in_block
-            idle += not in_block[peaks].any()
+            present[block] = [int(row) for row in np.flatnonzero(in_block * peaks)]
     rows, cols = scene.image.shape
     total = rows * cols
     zenith, _ = view_samples(scene)
@@ -46,7 +51,8 @@ def forecast(scene: Scene) -> dict[str, Any]:
         },
         "no_material": float(counts[0] / total),
         "blocks": len(cut),
-        "blocks_no_specular_material": idle,
+        "blocks_no_specular_material": sum(not rows for rows in present.values()),
+        "negligible": by_threshold(scene, present),
         "disk_mb": disk_bytes(scene)[1] / 1e6,
         "memory_mb": memory_mb(scene),
         "current": is_current(scene),
@@ -62,10 +68,11 @@ def disk_bytes(scene: Scene) -> tuple[float, float]:
     pixels = image.shape[0] * image.shape[1]
     image_bytes = pixels * pixel_bytes(image)
     sizes = {name: pixels * size for name, size in PRODUCT_BYTES.items()} | {"uncertainty": 4 * pixels * image.bands}
-    each = [sizes.get(product, image_bytes) for product in output.products]
+    products = written_products(scene)
+    each = [sizes.get(product, image_bytes) for product in products]
     most = sum(each) * OVERVIEWS + max(each, default=0) if output.format == "cog" else sum(each)
     most += BESIDE_BYTES
-    if "corrected" not in output.products:
+    if "corrected" not in products:
         return 0.0, most
     codec = output.compression or image.profile["compress"]
     least = image_bytes if codec == "none" else min(image_bytes, image.path.stat().st_size)

@@ -160,7 +160,7 @@ def plan_scene(
         for name in names
     )
     for surface, _, rules in materials:
-        if rules.method == "ratio" and rules.enabled and surface.has_peak:
+        if rules is not None and rules.method == "ratio" and rules.enabled and surface.has_peak:
             checks(check_ratio, surface, wavelengths, image.bands)
     ground_level, highest = checks(_heights, settings.surface, surface_files) or (0.0, 0.0)
     checks(seen.view.check, image.grid, highest)
