@@ -130,6 +130,7 @@ def main(folder, share, shares, kills, signals, seed):
     share, shares : this process does every so many of them.
     """
     folder, share, shares = Path(folder), int(share), int(shares)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background is started to ignore it
     warm_up()
     steps, lasts = count_steps(folder, folder / f"steps{share}")
     keys = {publish.read_manifest(folder / kind / "a")["key"]: kind for kind in ("old", "new")}

@@ -45,7 +45,8 @@ def with_and_without(folder, *scenes, products=("corrected", "flags", "removed")
     """The same scene with `skip` and without, reports first."""
     output = {"directory": "out", "quicklook": False, "products": list(products)}
     results = [
-        run(write_config(folder, *scenes, output=output, run={"skip": skip}, **sections)) for skip in (True, False)
+        run(write_config(folder, *scenes, output=output, run={"skip": skip, "memory_limit_mb": 2000}, **sections))
+        for skip in (True, False)
     ]
     (skipped, rasters), (whole, others) = results
     assert set(rasters) == set(others) == set(products)

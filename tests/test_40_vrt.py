@@ -212,7 +212,8 @@ def test_the_image_is_read_only_where_it_must_be(tmp_path, monkeypatch, nodata, 
     write_image(tmp_path / "image.tif", values, nodata=nodata, **tiles)
     materials = {"classes": {str(TILE): "red_aluminum", str(GROUND): "lambertian"}}
     output = {"directory": "vrt", "quicklook": False, "corrected": "vrt"}
-    config = write_config(tmp_path, scene, output=output, materials=materials)
+    roomy = {"memory_limit_mb": 2000}
+    config = write_config(tmp_path, scene, output=output, materials=materials, run=roomy)
     pixels = image_reads(monkeypatch)
     folder, report = run(config)
     assert len(pixels) == units

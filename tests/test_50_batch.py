@@ -298,7 +298,7 @@ def test_no_more_threads_are_busy_than_there_are_workers(tmp_path, workers):
     write_image(tmp_path / "image.tif", np.full((3, 1024, 1024), 4000, np.int16), blockxsize=64, blockysize=64)
     write_raster(tmp_path / "class_map.tif", np.full((1024, 1024), TILE, np.uint8))
     write_raster(tmp_path / "dsm.tif", np.ones((1024, 1024), np.float32))
-    config = write_config(tmp_path, run={"memory_limit_mb": 230})
+    config = write_config(tmp_path, run={"memory_limit_mb": 390})
     command = [sys.executable, "-c", BUSY, config, str(workers)]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
     assert int(result.stdout) <= workers + 1  # one hashes the inputs beside the work

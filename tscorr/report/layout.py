@@ -205,7 +205,7 @@ def _sentences(report: Report, name: str) -> str:
             + (f"; on {percent(none)} of them it has no half maximum." if none >= 0.005 else ".")
         )
     spot = material["level_spot_m"]
-    if spot["across"] is not None:
+    if spot["across"] is not None and spot["along"] is not None:
         text += (
             f" Seen from this camera, its glare on level ground is a spot of {spot['along']:.0f} m along the plane of "
             f"the sun and {spot['across']:.0f} m across."
