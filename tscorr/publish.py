@@ -125,7 +125,7 @@ class EarlyHashes:
         self._paths = list(paths)
         self._stop = threading.Event()
         self._pool = ThreadPoolExecutor(1)
-        self._hashes = [self._pool.submit(sha256, path, self._stop) for path in self._paths]
+        self._hashes = [self._pool.submit(_input_sha256, path, self._stop) for path in self._paths]
 
     def __enter__(self) -> Self:
         return self
@@ -146,6 +146,23 @@ def sha256(path: Path, stop: threading.Event | None = None) -> str:
         while (size := file.readinto(buffer)) and not (stop is not None and stop.is_set()):
             digest.update(buffer[:size])
     return digest.hexdigest()
+
+
+_KNOWN: dict[tuple[Path, int, int], str] = {}
+"""hashes of the inputs of late by path, size and time of change: a surface model serves all scenes of a batch"""
+MOST_KNOWN = 64
+
+
+def _input_sha256(path: Path, stop: threading.Event) -> str:
+    """SHA-256 of an input that is read once, unless it changes."""
+    status = path.stat()
+    version = path, status.st_size, status.st_mtime_ns
+    digest = _KNOWN.pop(version, None) or sha256(path, stop)
+    if not stop.is_set():
+        _KNOWN[version] = digest
+        while len(_KNOWN) > MOST_KNOWN:
+            del _KNOWN[next(iter(_KNOWN))]
+    return digest
 
 
 def identities(paths: Iterable[Path]) -> dict[str, dict[str, int]]:

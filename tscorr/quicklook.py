@@ -306,6 +306,10 @@ def _image(pixels: NDArray[np.uint8] | NDArray[np.float16]) -> Any:
     return image
 
 
+FAST_PNG = {"png:compressionLevel": 1, "png:filter": 0x40}
+"""each pixel against the mean of two neighbours: a tenth of the default's time for 8 % more bytes"""
+
+
 def _write(image: Any, path: Path, file_format: str, colour_space: str) -> None:
     """Write under a hidden name, read it back and rename.
 
@@ -314,6 +318,8 @@ def _write(image: Any, path: Path, file_format: str, colour_space: str) -> None:
     from OpenImageIO import ImageInput, geterror
 
     image.specmod().set_colorspace(colour_space)
+    for key, value in FAST_PNG.items() if file_format == "png" else ():
+        image.specmod().attribute(key, value)
     partial = path.with_name(f".partial-{path.name}")
     try:
         if not image.write(str(partial), fileformat=file_format):

@@ -72,7 +72,7 @@ def _current(scene: Scene) -> SceneOutcome | None:
     log.info("scene '%s' is current", scene.name)
     target = target_of(scene)
     report = json.loads((target / "report.json").read_text(encoding="utf-8"))
-    return SceneOutcome(scene.name, "current", target, report=report)
+    return SceneOutcome.of(scene.name, "current", target, report)
 
 
 @contextmanager
@@ -194,7 +194,7 @@ def _outcome(work: Work, seconds: float) -> SceneOutcome:
     scene, future = work.scene, work.last
     if future.status == "finished":
         log.info("scene '%s' done after %.1f s", scene.name, seconds)
-        return SceneOutcome(scene.name, "done", target_of(scene), report=future.result())
+        return SceneOutcome.of(scene.name, "done", target_of(scene), future.result())
     message = _message(future)
     log.error("scene '%s' failed: %s", scene.name, message)
     return SceneOutcome(scene.name, "failed", target_of(scene), error=message)

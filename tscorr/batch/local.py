@@ -21,12 +21,12 @@ def outcomes(planned: Sequence[Scene], overwrite: bool, progress: SceneProgress)
             if not overwrite and is_current(scene):
                 report = json.loads((target / "report.json").read_text(encoding="utf-8"))
                 log.info("scene '%s' is current", scene.name)
-                yield SceneOutcome(scene.name, "current", target, report=report)
+                yield SceneOutcome.of(scene.name, "current", target, report)
                 continue
             started = time.perf_counter()
             report = correct_scene(scene, progress(scene))
             log.info("scene '%s' done in %.1f s", scene.name, time.perf_counter() - started)
-            yield SceneOutcome(scene.name, "done", target, report=report)
+            yield SceneOutcome.of(scene.name, "done", target, report)
         except Exception as error:  # one scene must not stop the batch
             expected = isinstance(error, TscorrError | OSError | MemoryError)
             message = str(error) or type(error).__name__

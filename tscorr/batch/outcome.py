@@ -1,6 +1,8 @@
 """What became of a batch and of its scenes."""
 
-from collections.abc import Callable
+import json
+import zlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,18 @@ class SceneOutcome:
     state: str
     folder: Path
     error: str = ""
-    report: dict[str, Any] | None = None
+    packed_report: bytes = b""
+    """report.json, compressed: a batch holds those of all its scenes"""
+
+    @classmethod
+    def of(cls, name: str, state: str, folder: Path, report: Mapping[str, Any]) -> "SceneOutcome":
+        """The outcome of a scene that has a report."""
+        return cls(name, state, folder, packed_report=zlib.compress(json.dumps(report).encode(), 1))
+
+    @property
+    def report(self) -> dict[str, Any] | None:
+        """The content of report.json, a copy at each call; None where the scene failed."""
+        return json.loads(zlib.decompress(self.packed_report)) if self.packed_report else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from tscorr import __version__, config, stac
 from tscorr.batch.outcome import BatchResult
@@ -58,14 +59,25 @@ def _key(folder: Path) -> str | None:
 def _lines(settings: config.Config, result: BatchResult) -> list[SceneLine]:
     """The scenes of this run, and those of the configuration that earlier runs have published."""
     lines = [
-        SceneLine(scene.name, scene.state, scene.folder.name, scene.error, scene.report) for scene in result.scenes
+        SceneLine(scene.name, scene.state, scene.folder.name, scene.error, _brief(scene.report))
+        for scene in result.scenes
     ]
     known = {scene.name for scene in result.scenes}
     for name in (str(scene.name) for scene in settings.scenes):
         report = result.folder / name / "report.json"
         if name not in known and report.exists():
-            lines.append(SceneLine(name, "earlier", name, report=json.loads(report.read_text(encoding="utf-8"))))
+            lines.append(
+                SceneLine(name, "earlier", name, report=_brief(json.loads(report.read_text(encoding="utf-8"))))
+            )
     return lines
+
+
+def _brief(report: dict[str, Any] | None) -> dict[str, Any] | None:
+    """A report without its tables, which no page of a batch shows: of many scenes they fill the memory."""
+    if report is None:
+        return None
+    tables = {"heading": [], "materials": {name: {**m, "width_at": []} for name, m in report["materials"].items()}}
+    return {**report, **tables}
 
 
 def _overlaps(result: BatchResult, planned: Sequence[Scene]) -> list[Overlap]:

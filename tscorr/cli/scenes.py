@@ -78,21 +78,22 @@ def print_outcome(result: "BatchResult") -> None:
     rows = [("scene", "material", "corrected", "uncorrectable", "share p95", "share max")]
     notes = []
     for scene in result.scenes:
-        if scene.report is None:
+        report = scene.report
+        if report is None:
             notes.append(f"{scene.name}: failed: {scene.error}")
             continue
-        for name, entry in scene.report["materials"].items():
+        for name, entry in report["materials"].items():
             share = entry["specular_share"]
             if entry["corrected"] + entry["uncorrectable"] > 0:
                 counts = f"{entry['corrected']:,}", f"{entry['uncorrectable']:,}"
                 rows.append((scene.name, name, *counts, percent(share["p95"]), percent(share["max"])))
-        if (residual := scene.report.get("residual_glare")) is not None:
+        if (residual := report.get("residual_glare")) is not None:
             notes.append(
                 f"{scene.name}: residual glare {residual['rms_before']:.4f} before, {residual['rms_after']:.4f} after "
                 f"(RMS of reflectance against the truth)"
                 + (f": {residual['ratio']:.3f} of it is left" if residual["ratio"] is not None else "")
             )
-        if bad := scene.report.get("bad_bands"):
+        if bad := report.get("bad_bands"):
             notes.append(f"{scene.name}: {left_alone(bad)}")
         if scene.state == "current":
             notes.append(f"{scene.name}: nothing to do, the result is current")

@@ -111,18 +111,19 @@ def finish(
     if "flags" in scene.config.output.products:
         style = flag_style(np.flatnonzero(sums.flags).tolist())
         (folder / "flags.qml").write_text(style, encoding="utf-8")
-    corrected = rasters.result(folder, "corrected", scene.image)
+    results = _results(scene, folder)
+    corrected = results.get("corrected")
     if corrected is not None and (residual := residual_glare(scene, corrected)) is not None:
         report["residual_glare"] = residual
     if scene.bad_names:
         report["bad_bands"] = scene.bad_names
     if (covered := coverage(scene, folder)) is not None:
         report["coverage"] = covered
-    picture = draw_quicklook(scene, folder) if scene.config.output.quicklook else None
+    picture = draw_quicklook(scene, folder, results) if scene.config.output.quicklook else None
     write_json(report, folder / "report.json")
-    widths = _decimated_widths(folder)
+    widths = _decimated_widths(results)
     (folder / "report.html").write_text(page(report, facts, picture, widths), encoding="utf-8")
-    write_json(stac_item(scene, folder, facts, report), folder / "item.json")
+    write_json(stac_item(scene, folder, results, facts, report), folder / "item.json")
     (folder / "settings.toml").write_text(tomli_w.dumps(settings_of(scene)), encoding="utf-8")
     inputs = hashes.entries()
     check_unchanged(scene)
@@ -212,14 +213,20 @@ def _sun_later(scene: Scene) -> Any:
     return lambda minutes: solar_path(start, minutes, latitude, longitude)
 
 
-def stac_item(scene: Scene, folder: Path, facts: SceneFacts, report: Mapping[str, Any]) -> dict[str, Any]:
-    """The STAC item of a scene that is being published."""
+def stac_item(
+    scene: Scene,
+    folder: Path,
+    results: Mapping[str, rasters.RasterInfo],
+    facts: SceneFacts,
+    report: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The STAC item of a scene that is being published; `results` by product."""
     zenith, azimuth = facts.centre_view_deg or (float("nan"), float("nan"))
     return stac.item(
         name=scene.name,
         grid=scene.grid,
         datetime=scene.sun.time,
-        files=_results(scene, folder),
+        files=results,
         cloud_optimised=scene.config.output.format == "cog",
         strips=sorted(path.name for path in folder.glob("*.*.tif")),
         inputs=scene.inputs,
@@ -241,8 +248,8 @@ def _results(scene: Scene, folder: Path) -> dict[str, rasters.RasterInfo]:
     return {product: info for product, info in found.items() if info is not None}
 
 
-def _decimated_widths(folder: Path) -> Array | None:
-    info = rasters.result(folder, "azimuthal_width")
+def _decimated_widths(results: Mapping[str, rasters.RasterInfo]) -> Array | None:
+    info = results.get("azimuthal_width")
     return None if info is None else rasters.read_decimated(info, PICTURE_PX)[0]
 
 

@@ -41,7 +41,9 @@ class Ground:
         self._scene = scene
         self._files = ExitStack()
         self._heights = self._heights_reader()
-        self._shared = rasters.KeptReader(self._heights) if self._heights is not None else None
+        self._shared_heights = rasters.KeptReader(self._heights).read if self._heights is not None else None
+        """heights of a block whose surroundings are read for other blocks too; no method of this object: the surface
+        holds on to it, and a ring of references keeps its blocks in memory for many scenes more"""
         self._lock = threading.Lock()
         self._known_surface: Surface | None = None
         self._relief_m = 0.0
@@ -68,11 +70,6 @@ class Ground:
         """Heights of a block that is read once, whatever its size."""
         assert self._heights is not None
         return self._heights.read(block, 1)
-
-    def _shared_heights(self, block: Block) -> Array:
-        """Heights of a block whose surroundings are read for other blocks too."""
-        assert self._shared is not None
-        return self._shared.read(block)
 
     @property
     def surface(self) -> Surface:
@@ -111,15 +108,13 @@ class Ground:
         cell_x_m, cell_y_m = self._scene.grid.cell_size
         if isinstance(settings, config.FlatSettings):
             return FlatSurface(settings.height_m)
+        heights = self._shared_heights
         if isinstance(settings, config.DsmSettings) and settings.kind == "roof_planes":
-            return RoofPlaneSurface(
-                self._shared_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level_m, noise_m=noise_m
-            )
+            assert heights is not None
+            return RoofPlaneSurface(heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level_m, noise_m=noise_m)
         dsm: Surface = FlatSurface(0.0)
-        if self._heights is not None:
-            dsm = DsmSurface(
-                self._shared_heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level_m, noise_m=noise_m
-            )
+        if heights is not None:
+            dsm = DsmSurface(heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level_m, noise_m=noise_m)
         if isinstance(settings, config.DsmSettings):
             return dsm
         info = self._scene.surface_files[-1]
@@ -251,5 +246,6 @@ class Ground:
         reach = shadows.reach_m(self._relief_m, min(zenith, 80.0)) / min(cell_x_m, cell_y_m)
         halo = min(MARGIN_PX, int(np.ceil(reach)) + 1)
         window = slice(halo, halo + block.height), slice(halo, halo + block.width)
+        assert self._shared_heights is not None
         heights = self._shared_heights(block.padded(halo))
         return shadows.march(heights, view, cell_x_m=cell_x_m, cell_y_m=cell_y_m, window=window, needed=needed)

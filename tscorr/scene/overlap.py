@@ -6,7 +6,8 @@ the cost is bounded whatever the size of the images.
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from itertools import combinations
+from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from tscorr import rasters
 from tscorr.correction import PixelFlag, SpecularState, class_rows, specular_state
 from tscorr.errors import InputError
-from tscorr.grid import Block, Grid, reproject
+from tscorr.grid import Block, Grid, reproject, require_crs
 from tscorr.report import Difference, Overlap
 from tscorr.scene.plan import Scene
 
@@ -36,16 +37,39 @@ def overlaps(results: Sequence[tuple[Scene, Path]]) -> list[Overlap]:
 
     Scenes of other bands, or whose results lack the image or the flags, are not compared.
     """
-    whole = [(scene, folder) for scene, folder in results if _layers(scene, folder) is not None]
+    scenes = {folder: scene for scene, folder in results}
+    is_whole = cache(lambda folder: _layers(scenes[folder], folder) is not None)
     shared = [
         (region, one, two)
-        for one, two in combinations(whole, 2)
+        for one, two in _neighbours(results)
         if one[0].wavelengths_um == two[0].wavelengths_um
         and one[0].good_bands == two[0].good_bands
         and (region := common_region(one[0].grid, two[0].grid)) is not None
     ]
     shared.sort(key=lambda pair: -pair[0].height * pair[0].width)
-    return [difference(one, two, region) for region, one, two in shared[:MOST_PAIRS]]
+    compared = ((region, one, two) for region, one, two in shared if is_whole(one[1]) and is_whole(two[1]))
+    return [difference(one, two, region) for region, one, two in islice(compared, MOST_PAIRS)]
+
+
+def _neighbours(results: Sequence[tuple[Scene, Path]]) -> Iterator[tuple[tuple[Scene, Path], tuple[Scene, Path]]]:
+    """Pairs of scenes whose boxes meet in the CRS of the first scene: few of all pairs, and all that share ground."""
+    boxes = np.array([_box(scene.grid, results[0][0].grid) for scene, _ in results]).reshape(-1, 4)
+    for first, (west, south, east, north) in enumerate(boxes):
+        rest = boxes[first + 1 :]
+        apart = (rest[:, 0] > east) | (rest[:, 2] < west) | (rest[:, 1] > north) | (rest[:, 3] < south)
+        for second in np.flatnonzero(~apart).tolist():
+            yield results[first], results[first + 1 + second]
+
+
+def _box(grid: Grid, common: Grid) -> tuple[float, float, float, float]:
+    """Least and largest coordinates of a grid in the CRS of another, a little wide; nan where it has none."""
+    try:
+        same = grid.crs == common.crs
+        x, y = grid.corners() if same else reproject(require_crs(grid), require_crs(common), *grid.corners())
+    except InputError:
+        return (np.nan,) * 4
+    wide, high = 0.05 * np.ptp(x), 0.05 * np.ptp(y)  # sides bend between CRSs
+    return float(x.min() - wide), float(y.min() - high), float(x.max() + wide), float(y.max() + high)
 
 
 def _layers(scene: Scene, folder: Path) -> tuple[rasters.RasterInfo, rasters.RasterInfo] | None:

@@ -1,6 +1,6 @@
 """Pictures of images: before and after the correction, and of one image alone."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,13 +24,13 @@ BANDS_AT_ONCE = 8
 """bands of one file are read together: where they are stored together, each piece is then decoded once"""
 
 
-def draw_quicklook(scene: "Scene", folder: Path) -> Path:
-    """The picture of before, after and flags, of a scene that is being published."""
+def draw_quicklook(scene: "Scene", folder: Path, results: Mapping[str, rasters.RasterInfo]) -> Path:
+    """The picture of before, after and flags, of a scene that is being published; `results` by product."""
     image = scene.image
     wavelengths = _good(scene.wavelengths_um, image)
     matrix = quicklook.rgb_matrix(wavelengths, image.fwhm_um)
     used = quicklook.used_bands(matrix)
-    result = rasters.result(folder, "corrected", image) or image
+    result = results.get("corrected", image)
     scale, offset = scene.stored.scale, scene.stored.offset
 
     def light(info: rasters.RasterInfo) -> Array:
@@ -39,7 +39,7 @@ def draw_quicklook(scene: "Scene", folder: Path) -> Path:
     with ThreadPoolExecutor(2) as readers:  # to decode them is most of the work
         before, after = readers.map(light, (image, result))
     path = folder / "quicklook.png"
-    flag_file = rasters.result(folder, "flags")
+    flag_file = results.get("flags")
     flags = np.zeros(before.shape[:2], np.uint16)
     if flag_file is not None:
         flags = rasters.read_decimated_flags(flag_file, PICTURE_PX)

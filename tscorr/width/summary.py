@@ -99,50 +99,52 @@ def heading_table(
         raise InputError(f"solar zenith = {solar_zenith_deg} degrees; allowed is from 0 to below 90")
     if not 0 < half_field_of_view_deg < 90:
         raise InputError(f"half field of view = {half_field_of_view_deg} degrees; allowed is 0 to 90")
-    rows = []
-    for heading in HEADINGS_DEG:
-        scan_angle = _scan_angles(solar_zenith_deg, solar_azimuth_deg, half_field_of_view_deg, heading)
-        view_azimuth = heading + np.where(scan_angle < 0, -90.0, 90.0)
-        geometry = reference.geometry_from_angles(
-            np.full_like(scan_angle, solar_zenith_deg),
-            np.abs(scan_angle),
-            relative_azimuth(view_azimuth, solar_azimuth_deg),
-        )
-        rows.append(
-            {
-                "heading_deg": heading,
-                "min_facet_tilt_deg": math.degrees(geometry.alpha.min()),
-                "max_specular_share": {
-                    name: _max_share(geometry, bands, direct_fraction, simplified=simplified)
-                    for name, bands in materials.items()
-                },
-            }
-        )
-    return rows
+    headings = np.array(HEADINGS_DEG, dtype=float)[:, np.newaxis]
+    scan_angle = _scan_angles(solar_zenith_deg, solar_azimuth_deg, half_field_of_view_deg, headings)
+    view_azimuth = headings + np.where(scan_angle < 0, -90.0, 90.0)
+    geometry = reference.geometry_from_angles(
+        np.full_like(scan_angle, solar_zenith_deg),
+        np.abs(scan_angle),
+        relative_azimuth(view_azimuth, solar_azimuth_deg),
+    )
+    least_tilt = np.rad2deg(geometry.alpha.min(axis=1)).tolist()
+    shares = {
+        name: _max_share(geometry, bands, direct_fraction, simplified=simplified).tolist()
+        for name, bands in materials.items()
+    }
+    return [
+        {
+            "heading_deg": heading,
+            "min_facet_tilt_deg": least_tilt[place],
+            "max_specular_share": {name: share[place] for name, share in shares.items()},
+        }
+        for place, heading in enumerate(HEADINGS_DEG)
+    ]
 
 
 def _scan_angles(
-    solar_zenith_deg: float, solar_azimuth_deg: float, half_field_of_view_deg: float, heading_deg: float
+    solar_zenith_deg: float, solar_azimuth_deg: float, half_field_of_view_deg: float, headings_deg: Array
 ) -> Array:
-    """View zeniths along the scan line, negative to the left of the heading. [deg]"""
+    """View zeniths along scan lines, negative to the left of the heading: (headings, n) of (headings, 1). [deg]"""
     steps = math.ceil(2 * half_field_of_view_deg / SCAN_STEP_DEG)
     regular = np.linspace(-half_field_of_view_deg, half_field_of_view_deg, steps + 1)
     mirror = unit_vector(solar_zenith_deg, solar_azimuth_deg + 180)
-    to_the_right = mirror @ unit_vector(90, heading_deg + 90)
-    nearest = np.rad2deg(np.arctan2(to_the_right, mirror[2]))
-    return np.append(regular, np.clip(nearest, -half_field_of_view_deg, half_field_of_view_deg))
+    to_the_right = np.tensordot(mirror, unit_vector(90, headings_deg + 90), 1)
+    nearest = np.clip(np.rad2deg(np.arctan2(to_the_right, mirror[2])), -half_field_of_view_deg, half_field_of_view_deg)
+    return np.hstack([np.broadcast_to(regular, (len(headings_deg), regular.size)), nearest])
 
 
 def _max_share(
     geometry: reference.Geometry, bands: BandParameters, direct_fraction: ArrayLike, *, simplified: bool
-) -> float:
-    """Largest specular share over the bands and the directions of a geometry (n,)."""
+) -> Array:
+    """Largest specular share over the bands and the directions of a geometry (lines, n): (lines,)."""
     lobes, lobe_of_band = np.unique(np.stack([bands.w, bands.n, bands.k]), axis=1, return_inverse=True)
-    w, n, k = lobes[..., np.newaxis]
-    f_spec = reference.specular(geometry, w, n, k, simplified=simplified).max(axis=1)
-    peak = np.asarray(direct_fraction) * bands.t1 * f_spec[lobe_of_band]
-    total = peak + bands.t0
-    return float((peak / np.where(total > 0, total, 1)).max())
+    w, n, k = lobes[..., np.newaxis, np.newaxis]
+    f_spec = reference.specular(geometry, w, n, k, simplified=simplified).max(axis=2)
+    peak = (np.asarray(direct_fraction) * bands.t1 * f_spec[lobe_of_band].T).T
+    total = peak + bands.t0[:, np.newaxis]
+    share: Array = (peak / np.where(total > 0, total, 1)).max(axis=0)
+    return share
 
 
 def _or_none(value: float) -> float | None:
