@@ -576,7 +576,8 @@ def test_places_of_tiles_are_those_that_gdal_names(tmp_path, bigtiff, endianness
     options = {"bigtiff": bigtiff, "endianness": endianness, "blockxsize": tile, "blockysize": tile}
     path = write_raster(tmp_path / "x.tif", image_values(), interleave="band", **options)
     content = path.read_bytes()
-    places = tiff.directory(content)
+    read = tiff.bytes_of(content)
+    places = tiff.directory(read)
     with rasterio.open(path) as file:
         layout = tiff.Layout(file.shape, (tile, tile), BANDS)
         named = {
@@ -587,15 +588,15 @@ def test_places_of_tiles_are_those_that_gdal_names(tmp_path, bigtiff, endianness
             ]
             for what in ("OFFSET", "SIZE")
         }
-    assert places.offsets.of(content).tolist() == named["OFFSET"]
-    assert places.sizes.of(content).tolist() == named["SIZE"]
+    assert places.offsets.of(read).tolist() == named["OFFSET"]
+    assert places.sizes.of(read).tolist() == named["SIZE"]
     np.testing.assert_array_equal(layout.numbers(WHOLE).ravel(), np.arange(len(named["SIZE"])))
 
 
 @pytest.mark.parametrize("content", [b"", b"II*\0", b"GIF89a..........", b"II*\0\x08\0\0\0\0\0\0\0"])
 def test_what_is_no_tiff_has_no_places(content):
     with pytest.raises(ValueError, match="no whole TIFF"):
-        tiff.directory(content)
+        tiff.directory(tiff.bytes_of(content))
 
 
 def test_a_folder_that_does_not_exist_is_named(tmp_path):

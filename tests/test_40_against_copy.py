@@ -53,7 +53,9 @@ def test_defaults_cog_and_report(tmp_path):
 
 
 def test_the_other_sections_name_their_bars(tmp_path, quick):
-    found = measured(tmp_path, "workers", "memory", "growth", "sight")
+    found = measured(tmp_path, "difference", "workers", "memory", "growth", "sight")
+    assert found["vrt / run, zstd"].most == 0.7
+    assert found["2 % of the tiles, vrt / run of all, deflate"].most == 0.15
     assert found["one worker / two workers, zstd"].least == 1.6
     assert found["peak memory, six times as wide, MB"].most == 450
     assert f"time of a pixel, {2 * SIZE} / {int(0.2 * SIZE)} columns" in found

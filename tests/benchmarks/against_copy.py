@@ -20,7 +20,7 @@ from unittest import mock
 
 import numpy as np
 import rasterio
-from city import CELL_M, Lattice, make_city, profile_of, write_config
+from city import CELL_M, Lattice, make_city, make_sparse_classes, profile_of, write_config
 from measuring import Ratio, as_json, interleaved, peak_mb, ratio, table
 from rasterio.shutil import copy as copy_raster
 
@@ -163,6 +163,28 @@ def defaults(bench):
             yield Ratio(f"report and quicklook / {name} run, ZSTD 1", report_share(paths[name]), most=0.05)
 
 
+def difference(bench):
+    """Only what was removed, with a VRT that subtracts it; where all tiles have a peak, and where few have."""
+    for codec in ("none", "zstd", "deflate"):
+        with bench.city(codec=codec) as image:
+            few = {"class_map": make_sparse_classes(image, 0.02)}
+            configs = {
+                name: write_config(image, name=name, **keys)
+                for name, keys in {
+                    "run": {},
+                    "vrt": {"corrected": "vrt"},
+                    "few, run": few,
+                    "few, vrt": {"corrected": "vrt", **few},
+                    "few, flat, vrt": {"corrected": "vrt", "flat": True, **few},
+                }.items()
+            }
+            times = bench.timed(**{name: partial(run, config) for name, config in configs.items()})
+        yield ratio(f"vrt / run, {codec}", times["vrt"], times["run"], most=0.7)
+        yield ratio(f"2 % of the tiles, vrt / run of all, {codec}", times["few, vrt"], times["run"], most=0.15)
+        yield ratio(f"2 % of the tiles, flat, vrt / run of all, {codec}", times["few, flat, vrt"], times["run"])
+        yield ratio(f"2 % of the tiles, run / run of all, {codec}", times["few, run"], times["run"])
+
+
 def report_share(config):
     """Share of a run's time that summary, page and quicklook take."""
     spent = []
@@ -263,6 +285,7 @@ def sight(bench):
 SECTIONS = {
     "ratios": ratios,
     "defaults": defaults,
+    "difference": difference,
     "workers": workers,
     "memory": memory,
     "growth": growth,

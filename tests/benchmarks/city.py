@@ -94,6 +94,18 @@ def make_city(folder, rows, cols, *, bands=4, codec="none", interleave="pixel", 
     return path
 
 
+def make_sparse_classes(image, share):
+    """The class map of a city that has materials with a peak in a share of the tiles only, beside it; its name."""
+    target = image.with_name("sparse_class_map.tif")
+    with rasterio.open(image.with_name("class_map.tif")) as whole, rasterio.open(target, "w", **whole.profile) as few:
+        windows = [window for _, window in whole.block_windows(1)]
+        kept = np.random.default_rng(SEED).permutation(len(windows)) < round(share * len(windows))
+        for window, keep in zip(windows, kept, strict=True):
+            classes = whole.read(1, window=window)
+            few.write(classes if keep else np.full_like(classes, GROUND), 1, window=window)
+    return target.name
+
+
 def write_config(
     image,
     *,
@@ -103,11 +115,13 @@ def write_config(
     products=("corrected", "flags"),
     quicklook=False,
     form="gtiff",
+    corrected="file",
+    class_map="class_map.tif",
     **run,
 ):
     """A configuration of the city beside its image; its path.
 
-    name : of the configuration. form : of the files. run : keys of [run].
+    name : of the configuration. form : of the files. corrected : a file, or a VRT. run : keys of [run].
     """
     with rasterio.open(image) as file:
         rows, cols = file.shape
@@ -116,7 +130,7 @@ def write_config(
     scene = {
         "name": "city",
         "image": str(image),
-        "class_map": str(image.with_name("class_map.tif")),
+        "class_map": str(image.with_name(class_map)),
         "sun": {"zenith_deg": 40.0, "azimuth_deg": 180.0},
         "view": {"kind": "frame", "position": [middle[0], middle[1] + 0.3 * side_m, 0.6 * side_m + 100]},
         "surface": {"kind": "flat"} if flat else {"kind": "dsm", "path": str(image.with_name("dsm.tif"))},
@@ -128,6 +142,7 @@ def write_config(
             "products": list(products),
             "quicklook": quicklook,
             "format": form,
+            "corrected": corrected,
         },
         "run": run,
         "materials": {"classes": {str(value): name for value, name in MATERIALS.items()}},

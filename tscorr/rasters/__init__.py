@@ -18,6 +18,7 @@ from tscorr.rasters.header import (
 from tscorr.rasters.joining import join_rows, result
 from tscorr.rasters.kept import KeptReader
 from tscorr.rasters.reading import Reader, read_decimated, read_decimated_flags, read_samples
+from tscorr.rasters.stored_tiles import StoredTiles
 from tscorr.rasters.writing import Layer, Writer, make_cog
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "Layer",
     "RasterInfo",
     "Reader",
+    "StoredTiles",
     "Writer",
     "can_hold",
     "check_metric",

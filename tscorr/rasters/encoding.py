@@ -60,8 +60,9 @@ class Encoder:
             with memory.open(**self._options, **cut, height=rows, width=cols, transform=anywhere) as dataset:
                 dataset.write(values, window=rasterio.windows.Window(0, 0, values.shape[2], values.shape[1]))
             content = memoryview(memory.getbuffer())
-            places = tiff.directory(content)
-            offsets, sizes = places.offsets.of(content), places.sizes.of(content)
+            read = tiff.bytes_of(content)
+            places = tiff.directory(read)
+            offsets, sizes = places.offsets.of(read), places.sizes.of(read)
             first, last = int(offsets.min()), int((offsets + sizes).max())
             yield Tiles(content[first:last], offsets - first, sizes)
 

@@ -1,9 +1,10 @@
 """Where a TIFF keeps its tiles or strips: what lets whole ones be written, and moved, as bytes.
 
-TIFF 6.0 and BigTIFF. All tags are GDAL's work; only the two lists of places and sizes are read and changed here.
+TIFF 6.0 and BigTIFF. All tags are GDAL's work; only the two lists of places and sizes are changed here.
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -13,11 +14,30 @@ from numpy.typing import NDArray
 from tscorr.grid import Block
 
 Array = NDArray[Any]
+Read = Callable[[int, int], Any]
+"""bytes of a file: from where, and how many; fewer where it ends before"""
 
 OFFSETS, SIZES = (273, 324), (279, 325)
 """tags of strips and of tiles"""
+CODING = {
+    258: "bits of a sample",
+    259: "codec",
+    262: "meaning of the samples",
+    266: "order of bits",
+    277: "samples of a pixel",
+    278: "rows of a strip",
+    284: "bands together or apart",
+    317: "predictor",
+    322: "columns of a tile",
+    323: "rows of a tile",
+    339: "kind of number",
+}
+"""tags that decide what values the bytes of a tile stand for"""
+MOST_SAMPLES = 1 << 16
+MEANING, PLAIN = 262, {0, 1, 2, 3}
+"""that of the samples; some that change no value: grey, white to black, colours, a palette"""
 WORDS = {3: "u2", 4: "u4", 16: "u8"}
-"""the types that these lists may have"""
+"""the types that these tags may have"""
 
 
 class Words(NamedTuple):
@@ -27,16 +47,27 @@ class Words(NamedTuple):
     dtype: np.dtype[Any]
     length: int
 
-    def of(self, content: Any) -> Array:
-        """The numbers, from the bytes of the file."""
-        return np.frombuffer(content, self.dtype, self.length, self.start).astype(np.int64)
+    def of(self, read: Read) -> Array:
+        """The numbers."""
+        octets = read(self.start, self.length * self.dtype.itemsize)
+        return np.frombuffer(octets, self.dtype, self.length).astype(np.int64)
 
 
 class Directory(NamedTuple):
-    """Where the first image of a TIFF says where its tiles are, and how long."""
+    """Where the first image of a TIFF says where its tiles are, how long, and how they are coded."""
 
     offsets: Words
     sizes: Words
+    coding: dict[int, Words]
+    """the tags of CODING that it has"""
+
+    def coded(self, read: Read) -> tuple[str, dict[int, set[int]]]:
+        """How bytes become values, equal for equal codings: their order, and the numbers of each tag of CODING.
+
+        1 stands for a tag that is missing, as TIFF has it.
+        """
+        numbers = {tag: set(self.coding[tag].of(read).tolist()) if tag in self.coding else {1} for tag in CODING}
+        return self.offsets.dtype.byteorder, numbers | ({MEANING: {1}} if numbers[MEANING] <= PLAIN else {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,26 +119,38 @@ def octets(values: Array) -> memoryview:
     return memoryview(values.view(np.uint8).reshape(-1)) if values.size else memoryview(b"")  # type: ignore[arg-type]
 
 
-def directory(content: Any) -> Directory:
-    """The lists of the first image, from the bytes of a file or of its beginning; ValueError where it has none."""
+def bytes_of(content: Any) -> Read:
+    """How to read a file that is in memory."""
+    return lambda start, size: content[start : start + size]
+
+
+def directory(read: Read, tiles: int | None = None) -> Directory:
+    """The lists of the first image of a file; ValueError where it has none, or of another number of tiles."""
     try:
-        order: Literal["<", ">"] = "<" if content[:2] == b"II" else ">"
-        big = struct.unpack_from(f"{order}H", content, 2)[0] == 43
-        (place,) = struct.unpack_from(f"{order}Q" if big else f"{order}I", content, 8 if big else 4)
+        order: Literal["<", ">"] = "<" if bytes(read(0, 2)) == b"II" else ">"
+        big = _numbers(read, 2, f"{order}H")[0] == 43
+        (place,) = _numbers(read, 8 if big else 4, f"{order}Q" if big else f"{order}I")
         count_type, entry_type, room = ("Q", "HHQ", 8) if big else ("H", "HHI", 4)
-        (entries,) = struct.unpack_from(order + count_type, content, place)
+        (entries,) = _numbers(read, place, order + count_type)
         place += struct.calcsize(order + count_type)
-        found = {}
+        found: dict[int, Words] = {}
         for _ in range(entries):
-            tag, kind, count = struct.unpack_from(order + entry_type, content, place)
+            tag, kind, count = _numbers(read, place, order + entry_type)
             place += struct.calcsize(order + entry_type)
-            if tag in OFFSETS + SIZES:
+            if tag in (*OFFSETS, *SIZES, *CODING):
                 dtype = np.dtype(WORDS[kind]).newbyteorder(order)
-                start = place
-                if count * dtype.itemsize > room:
-                    (start,) = struct.unpack_from(order + ("Q" if big else "I"), content, place)
-                found["offsets" if tag in OFFSETS else "sizes"] = Words(start, dtype, count)
+                fits = count * dtype.itemsize <= room
+                start = place if fits else _numbers(read, place, order + ("Q" if big else "I"))[0]
+                sane = count <= MOST_SAMPLES if tag in CODING else tiles in {None, count}
+                if not sane:
+                    raise ValueError(f"no whole TIFF: {count} numbers in tag {tag}")
+                found[tag] = Words(start, dtype, count)
             place += room
-        return Directory(**found)
-    except (KeyError, TypeError, struct.error) as error:
+        strips_or_tiles = 0 if OFFSETS[0] in found else 1
+        return Directory(found.pop(OFFSETS[strips_or_tiles]), found.pop(SIZES[strips_or_tiles]), found)
+    except (KeyError, OverflowError, struct.error) as error:
         raise ValueError(f"no whole TIFF: {error}") from None
+
+
+def _numbers(read: Read, start: int, types: str) -> tuple[Any, ...]:
+    return struct.unpack(types, read(start, struct.calcsize(types)))

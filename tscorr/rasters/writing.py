@@ -17,8 +17,9 @@ from rasterio.shutil import copy as copy_raster
 from tscorr.errors import OutputError
 from tscorr.grid import Block
 from tscorr.rasters import tiff
-from tscorr.rasters.encoding import Encoder
+from tscorr.rasters.encoding import Encoder, Tiles
 from tscorr.rasters.header import ENVIRONMENT, RasterInfo, tile_side
+from tscorr.rasters.stored_tiles import StoredTiles
 
 Array = NDArray[Any]
 
@@ -61,12 +62,13 @@ class Writer:
                 _describe(dataset, layer, like)
                 planes = dataset.count if dataset.interleaving == Interleaving.band else 1
                 self._layout = tiff.Layout(dataset.shape, dataset.block_shapes[0], planes)
-            header = path.read_bytes()
+            header = tiff.bytes_of(path.read_bytes())
             self._places = tiff.directory(header)
+            self._coded = self._places.coded(header)
             self._file = os.open(path, os.O_RDWR)
         except (RasterioError, OSError, ValueError) as error:
             raise OutputError(f"{path} cannot be written: {error}") from None
-        self._end = len(header)
+        self._end = path.stat().st_size
         self._offsets, self._sizes = self._places.offsets.of(header), self._places.sizes.of(header)
         self._encoder = Encoder(options, self._layout, tiled=bool(options.get("tiled")))
 
@@ -76,20 +78,38 @@ class Writer:
         used = self._layout.nonzero(numbers.shape, values).ravel() if self._sparse else np.ones(numbers.size, np.bool_)
         if not used.any():
             return
-        numbers = numbers.ravel()[used]
         try:
             with self._encoder(values) as encoded:
-                tiles = encoded if used.all() else encoded.of(used)
-                with self._lock:
-                    start, self._end = self._end, self._end + len(tiles.data)
-                    self._sample = self._sample or (block, checksum(np.ascontiguousarray(values).data))
-                write_at(self._file, tiles.data, start)
-                written = Stretch(start, len(tiles.data), checksum(tiles.data))
-                with self._lock:
-                    self._written.append(written)
-                    self._offsets[numbers], self._sizes[numbers] = start + tiles.offsets, tiles.sizes
-        except (RasterioError, OSError) as error:
+                self._put(numbers.ravel()[used], encoded if used.all() else encoded.of(used))
+        except RasterioError as error:
             raise OutputError(f"{self.path} cannot be written: {error}") from None
+        with self._lock:
+            self._sample = self._sample or (block, checksum(np.ascontiguousarray(values).data))
+
+    def copies(self, tiles: StoredTiles) -> bool:
+        """Whether `copy` may take the tiles of that file: here, too, their bytes hold their values."""
+        return tiles.coded == self._coded
+
+    def copy(self, block: Block, stored: StoredTiles, source: Block) -> None:
+        """Write the tiles of a block of an image, `source`, as those of a block of this file."""
+        self._put(self._layout.numbers(block).ravel(), stored.tiles(source))
+        if self._sample is None:
+            sample = block, checksum(stored.decode(source).data)
+            with self._lock:
+                self._sample = self._sample or sample
+
+    def _put(self, numbers: Array, tiles: Tiles) -> None:
+        """Write encoded tiles of these numbers behind those that are there."""
+        with self._lock:
+            start, self._end = self._end, self._end + len(tiles.data)
+        try:
+            write_at(self._file, tiles.data, start)
+        except OSError as error:
+            raise OutputError(f"{self.path} cannot be written: {error}") from None
+        written = Stretch(start, len(tiles.data), checksum(tiles.data))
+        with self._lock:
+            self._written.append(written)
+            self._offsets[numbers], self._sizes[numbers] = start + tiles.offsets, tiles.sizes
 
     def abandon(self) -> None:
         """Close without a check; what was written will be deleted."""
@@ -98,7 +118,7 @@ class Writer:
     def close(self) -> None:
         """Close, and raise OutputError unless every block reads back as it was written."""
         try:
-            for words, numbers in zip(self._places, (self._offsets, self._sizes), strict=True):
+            for words, numbers in ((self._places.offsets, self._offsets), (self._places.sizes, self._sizes)):
                 write_at(self._file, tiff.octets(numbers.astype(words.dtype)), words.start)
             whole = (self._sparse or bool(self._sizes.all())) and all(
                 checksum(read_at(self._file, stretch)) == stretch.checksum for stretch in self._written

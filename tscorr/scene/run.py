@@ -193,6 +193,7 @@ class Pipeline:
             with self.sums.timed("geometry"):
                 self._prepare()
             self.writers = {name: writer_of(scene, self.folder, name, self._strip) for name in sorted(self._products)}
+            self._stored = self._stored_tiles(files)
             try:
                 run_all(self.block, units_of(scene, self._strip), workers_of(scene), progress)
             except BaseException:
@@ -203,6 +204,17 @@ class Pipeline:
                 list(pool.map(self._close, self.writers.items()))
             if self._as_difference and self._strip is None:
                 write_corrected_vrt(scene, self.folder)
+
+    def _stored_tiles(self, files: ExitStack) -> rasters.StoredTiles | None:
+        """The image's tiles as they are stored, where the corrected image can hold them; `files` closes them."""
+        writer = self.writers.get("corrected")
+        if not (isinstance(writer, rasters.Writer) and self.scene.config.run.skip):
+            return None
+        try:
+            tiles = files.enter_context(rasters.StoredTiles(self.scene.image, self.image.read))
+        except (OSError, ValueError):  # no TIFF
+            return None
+        return tiles if writer.copies(tiles) else None
 
     def _close(self, product: tuple[str, rasters.Writer | rasters.EnviWriter]) -> None:
         """Close and check one raster; make it what was asked for."""
@@ -224,7 +236,8 @@ class Pipeline:
         """Read, correct and write one block; the number of its pixels."""
         with self.sums.timed("read"):
             rows = class_rows(self.classes.read(block, 1), self.scene.rows)
-            unread = self._as_difference and not self._skipping.flags_need_image
+            stored = self._stored if self._stored is not None and self._stored.holds(block) else None
+            unread = (self._as_difference or stored is not None) and not self._skipping.flags_need_image
             image, bad = (None, None) if unread else self._read_image(block)
         needed = self.corrector.peaks[rows]
         with self.sums.timed("geometry"):
@@ -243,7 +256,9 @@ class Pipeline:
             layers = self._idle_layers(block)
         if bad is not None:
             self.bad_bands.put_back(result.corrected, bad)
-        layers |= {"corrected": result.corrected, "flags": result.flags[None]}
+        layers |= {"flags": result.flags[None]}
+        if stored is None or (idle is None and not dark):
+            layers["corrected"], stored = result.corrected, None
         if result.removed is not None:
             layers["removed"] = result.removed
         if result.sigma is not None:
@@ -251,11 +266,18 @@ class Pipeline:
             if self.scene.image.bad_bands:
                 result.sigma[np.array(self.scene.image.bad_bands)] = np.nan
         with self.sums.timed("write"):
-            for name, writer in self.writers.items():
-                if name in layers:
-                    writer.write(block if self._strip is None else block.below(-self._strip.row), layers[name])
+            self._write(block, layers, stored)
         self.sums.add(result, rows, SHADOW_OR_NODATA if dark else None if idle is None else idle.reason)
         return rows.size
+
+    def _write(self, block: Block, layers: dict[str, Array], stored: rasters.StoredTiles | None) -> None:
+        """Write the layers of a block; `stored` holds the corrected image where nothing changed."""
+        target = block if self._strip is None else block.below(-self._strip.row)
+        for name, writer in self.writers.items():
+            if name in layers:
+                writer.write(target, layers[name])
+            elif name == "corrected" and stored is not None and isinstance(writer, rasters.Writer):
+                writer.copy(target, stored, block)
 
     def _idle_layers(self, block: Block) -> dict[str, Array]:
         """What is written of a block in which nothing was looked for; a sparse raster needs no zeros."""

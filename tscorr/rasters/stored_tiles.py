@@ -1,0 +1,72 @@
+"""Tiles of a GeoTIFF as they are stored: those that nothing is removed from are copied without being decoded."""
+
+import math
+import os
+from collections.abc import Callable
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tscorr.errors import InputError
+from tscorr.grid import Block
+from tscorr.rasters import tiff
+from tscorr.rasters.encoding import Tiles
+from tscorr.rasters.header import RasterInfo
+
+Array = NDArray[Any]
+
+LARGEST = 1.5
+"""bytes of an encoded tile, at most, for one of its values' bytes: more is no codec's work"""
+
+
+class StoredTiles:
+    """The encoded tiles of an image; any thread may ask.
+
+    info : of the image. decode : its values (bands, rows, cols) in a block.
+    Raises ValueError where its tiles cannot be found, and OSError where it cannot be read.
+    """
+
+    def __init__(self, info: RasterInfo, decode: Callable[[Block], Array]) -> None:
+        self.decode = decode
+        self._info = info
+        by_pixel = info.profile["interleave"] == "pixel"
+        self._layout = tiff.Layout(info.shape, info.tile, 1 if by_pixel else info.bands)
+        values = info.tile[0] * info.tile[1] * (info.bands if by_pixel else 1)
+        self._largest = LARGEST * values * info.dtype.itemsize + 1024
+        self._file = os.open(info.path, os.O_RDONLY)
+        try:
+            places = tiff.directory(self._read, self._layout.planes * math.prod(self._layout.tiles))
+            self._offsets, self._sizes = places.offsets.of(self._read), places.sizes.of(self._read)
+            self.coded = places.coded(self._read)
+            """as of `tiff.Directory`"""
+        except BaseException:
+            self.close()
+            raise
+
+    def holds(self, block: Block) -> bool:
+        """Whether all tiles of a block are stored, which those of a sparse file are not, and of a size that can be."""
+        sizes = self._sizes[self._layout.numbers(block)]
+        return bool(np.all((sizes > 0) & (sizes <= self._largest)))
+
+    def tiles(self, block: Block) -> Tiles:
+        """The tiles of a block; InputError where the file ends before."""
+        numbers = self._layout.numbers(block).ravel()
+        sizes = self._sizes[numbers]
+        data = b"".join(map(self._read, self._offsets[numbers].tolist(), sizes.tolist()))
+        if len(data) != sizes.sum():
+            raise InputError(f"{self._info.path} cannot be read: it ends within a tile of {block}")
+        return Tiles(memoryview(data), np.cumsum(sizes) - sizes, sizes)
+
+    def _read(self, start: int, size: int) -> bytes:
+        return os.pread(self._file, size, start)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
