@@ -3,6 +3,7 @@
 GDAL never applies scale and offset; neither does anything here: blocks hold stored values.
 """
 
+from tscorr.rasters.decimated import read_decimated, read_decimated_flags
 from tscorr.rasters.difference import expressible, write_difference
 from tscorr.rasters.envi_writing import ENVI_SUFFIX, EnviWriter
 from tscorr.rasters.header import (
@@ -17,7 +18,7 @@ from tscorr.rasters.header import (
 )
 from tscorr.rasters.joining import join_rows, result
 from tscorr.rasters.kept import KeptReader
-from tscorr.rasters.reading import Reader, read_decimated, read_decimated_flags, read_samples
+from tscorr.rasters.reading import Reader, read_samples
 from tscorr.rasters.stored_tiles import StoredTiles
 from tscorr.rasters.writing import Layer, Writer, make_cog
 

@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -13,8 +12,7 @@ from rasterio.vrt import WarpedVRT
 
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
-from tscorr.rasters.envi import PixelByPixel
-from tscorr.rasters.header import ENVIRONMENT, RasterInfo, opened, reason_of
+from tscorr.rasters.header import ENVIRONMENT, RasterInfo, reason_of
 from tscorr.rasters.sound import GDAL_ERRORS, open_dataset
 
 Array = NDArray[Any]
@@ -56,8 +54,8 @@ class Reader:
         self._handles: list[Any] = []
         self._lock = threading.Lock()
 
-    def read(self, block: Block, bands: int | None = None) -> Array:
-        """Stored values of a block: (bands, rows, cols), or (rows, cols) of one band."""
+    def read(self, block: Block, bands: int | Sequence[int] | None = None) -> Array:
+        """Stored values of a block: (bands, rows, cols) of all or some bands, or (rows, cols) of one; from 1 on."""
         try:
             return self._read(block, bands)
         except GDAL_ERRORS as error:
@@ -66,7 +64,7 @@ class Reader:
                 f"{self.info.path} cannot be read at {place}: {reason_of(error, self.info.path)}"
             ) from None
 
-    def _read(self, block: Block, bands: int | None) -> Array:
+    def _read(self, block: Block, bands: int | Sequence[int] | None) -> Array:
         dataset = self._dataset()
         row, col = block.row + self.shift[0], block.col + self.shift[1]
         top, left = max(row, 0), max(col, 0)
@@ -76,7 +74,7 @@ class Reader:
         if whole:
             values = self._pixels(dataset, inside, bands)
         else:
-            leading = () if bands is not None else (self.info.bands,)
+            leading = () if isinstance(bands, int) else (self.info.bands if bands is None else len(bands),)
             values = np.full((*leading, *block.shape), self._fill, self._out_type())
             if inside.height > 0 and inside.width > 0:
                 rows, cols = slice(top - row, bottom - row), slice(left - col, right - col)
@@ -88,10 +86,13 @@ class Reader:
                 values[values == np.float32(self.info.nodata)] = np.nan
         return values
 
-    def _pixels(self, dataset: Any, inside: Block, bands: int | None) -> Array:
+    def _pixels(self, dataset: Any, inside: Block, bands: int | Sequence[int] | None) -> Array:
         """Stored values of a block that lies inside the raster."""
-        pixels = self.info.pixel_by_pixel if self._aligned and bands is None else None
-        return dataset.read(bands, window=inside.window) if pixels is None else pixels.read(inside)
+        pixels = self.info.pixel_by_pixel if self._aligned and not isinstance(bands, int) else None
+        if pixels is None:
+            return dataset.read(bands, window=inside.window)
+        values = pixels.read(inside)
+        return values if bands is None else values[np.array(bands) - 1]
 
     def _out_type(self) -> np.dtype[Any]:
         return np.dtype(np.float32) if np.isnan(self._fill) else self.info.dtype
@@ -158,41 +159,6 @@ def _pixel_shift(raster: Grid, grid: Grid) -> tuple[int, int] | None:
     return shift if same_axes and max(drift) < MISALIGNED_PIXELS else None
 
 
-def read_decimated(info: RasterInfo, max_size: int, bands: Sequence[int] | None = None) -> Array:
-    """Stored values of a raster (bands, rows, cols), float32, no side longer than `max_size`.
-
-    Averages; nan where nodata or an infinite value is among them; overviews are used where the file has them.
-    """
-    rows, cols = info.shape
-    step = max(1.0, max(rows, cols) / max_size)
-    shape = max(1, round(rows / step)), max(1, round(cols / step))
-    indexes = list(bands or range(1, info.bands + 1))
-    if info.pixel_by_pixel is not None:
-        return _averages(info.pixel_by_pixel, shape, np.array(indexes) - 1, info.nodata)
-    with opened(info.path, ours=info.ours) as dataset:
-        values = dataset.read(indexes, out_shape=(len(indexes), *shape), resampling=Resampling.average, masked=True)
-    filled = np.ma.filled(values.astype(np.float32), np.nan)
-    filled[~np.isfinite(filled)] = np.nan
-    return filled
-
-
-def _averages(pixels: PixelByPixel, shape: tuple[int, int], bands: Array, nodata: float | None) -> Array:
-    """The same of a BIP file, read once, row by row: means of the valid values, float32 (bands, rows, cols)."""
-    rows, cols, _ = pixels.shape
-    row_edges, col_edges = np.arange(shape[0] + 1) * rows // shape[0], np.arange(shape[1] + 1) * cols // shape[1]
-    result = np.empty((len(bands), *shape), np.float32)
-    for i, (top, bottom) in enumerate(pairwise(row_edges)):
-        total, count = np.zeros((2, len(bands), shape[1]))
-        for row in range(top, bottom):
-            line = pixels.read(Block(row, 0, 1, cols))[bands, 0].astype(float)
-            missing = (line == nodata) | (np.isnan(line) & (nodata is not None and bool(np.isnan(nodata))))
-            line[np.isinf(line)] = np.nan
-            total += np.add.reduceat(np.where(missing, 0, line), col_edges[:-1], axis=1)
-            count += np.add.reduceat(~missing, col_edges[:-1], axis=1, dtype=float)
-        result[:, i] = total / np.where(count > 0, count, np.nan)
-    return result
-
-
 def read_samples(info: RasterInfo, most: int, side: int) -> Array:
     """Values of band 1 that are spread over a raster, float32 (pixels,), those that are not finite or nodata left out.
 
@@ -214,11 +180,3 @@ def read_samples(info: RasterInfo, most: int, side: int) -> Array:
 def _in_tile(first: int, side: int, tile: int) -> int:
     """The first pixel of a run of `side`, moved back so that the run does not leave its tile."""
     return min(first, max(first // tile * tile, (first // tile + 1) * tile - side)) if side <= tile else first
-
-
-def read_decimated_flags(info: RasterInfo, max_size: int) -> Array:
-    """A flag layer on the pixels of `read_decimated`: (rows, cols), the nearest value."""
-    rows, cols = info.shape
-    step = max(1.0, max(rows, cols) / max_size)
-    with opened(info.path, ours=info.ours) as dataset:
-        return dataset.read(1, out_shape=(max(1, round(rows / step)), max(1, round(cols / step))))

@@ -107,11 +107,13 @@ class Layout:
 
     def nonzero(self, shape: tuple[int, ...], values: Array) -> Array:
         """Which tiles (planes, rows, cols), of that shape, of a block (bands, rows, cols) hold anything but 0."""
-        _, down, right = shape
-        rows, cols = (np.arange(count) * size for count, size in zip((down, right), self.tile, strict=True))
-        by_row = np.logical_or.reduceat(values != 0, rows, axis=1)
-        found = np.logical_or.reduceat(by_row, cols, axis=2)
-        return found if self.planes > 1 else np.logical_or.reduce(found, axis=0, keepdims=True)
+        found = np.zeros(shape, np.bool_)
+        tile_rows, tile_cols = self.tile
+        for plane, i, j in np.ndindex(shape):
+            window = np.s_[i * tile_rows : (i + 1) * tile_rows, j * tile_cols : (j + 1) * tile_cols]
+            tile = values[plane, *window] if self.planes > 1 else values[:, *window]
+            found[plane, i, j] = tile.max() != 0 or tile.min() != 0  # a fraction of the time of tile.any()
+        return found
 
 
 def octets(values: Array) -> memoryview:

@@ -42,7 +42,7 @@ def horn_normals(
     normals = np.empty((3, *z.shape), np.float32)
     _horn(z, normals, 1.0 / (8.0 * cell_x_m), 1.0 / (8.0 * cell_y_m))
     unreliable = _unreliable(z, 1, max(cell_x_m, cell_y_m) if step_m is None else step_m)
-    _complete(z, normals, unreliable, 1, cell_x_m, cell_y_m)
+    _complete(z, normals, _incomplete(normals, 1), 1, cell_x_m, cell_y_m)
     return WindowNormals(normals, unreliable)
 
 
@@ -61,7 +61,7 @@ def plane_fit_normals(
     normals = np.empty((3, *z.shape), np.float32)
     _plane_fit(z, normals, radius, 1.0 / cell_x_m, 1.0 / cell_y_m)
     unreliable = _unreliable(z, radius, max(cell_x_m, cell_y_m) if step_m is None else step_m)
-    _complete(z, normals, unreliable, radius, cell_x_m, cell_y_m)
+    _complete(z, normals, _incomplete(normals, radius), radius, cell_x_m, cell_y_m)
     return WindowNormals(normals, unreliable)
 
 
@@ -121,43 +121,47 @@ def _set_normal(normals, i, j, east, north):
     normals[2, i, j] = up
 
 
+def _incomplete(normals: NDArray[np.float32], radius: int) -> NDArray[np.intp]:
+    """Rows and columns (2, pixels) of the pixels whose window is not whole: at the border and at voids."""
+    missing = np.ones(normals.shape[1:], np.bool_)
+    inner = (slice(radius, -radius), slice(radius, -radius))
+    missing[inner] = np.isnan(normals[2][inner])
+    return np.stack(np.nonzero(missing))
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _complete(z, normals, unreliable, radius, cell_x_m, cell_y_m):
-    """Normals where the window is not whole: at the border of the array and at voids."""
+def _complete(z, normals, places, radius, cell_x_m, cell_y_m):
+    """Normals of the pixels (2, pixels) of which the window is not whole."""
     rows, cols = z.shape
-    for i in range(rows):
-        inner_row = radius <= i < rows - radius
-        for j in range(cols):
-            inner = inner_row and radius <= j < cols - radius
-            if inner and not (unreliable[i, j] and math.isnan(normals[2, i, j])):
-                continue
-            n, x, y, h, xx, xy, yy, xh, yh = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            datum = 0.0
-            for a in range(max(0, i - radius), min(rows, i + radius + 1)):
-                for b in range(max(0, j - radius), min(cols, j + radius + 1)):
-                    if not math.isfinite(z[a, b]):
-                        continue
-                    if n == 0:
-                        datum = z[a, b]
-                    u, v, d = (b - j) * cell_x_m, (i - a) * cell_y_m, z[a, b] - datum
-                    n += 1
-                    x += u
-                    y += v
-                    h += d
-                    xx += u * u
-                    xy += u * v
-                    yy += v * v
-                    xh += u * d
-                    yh += v * d
-            east, north = 0.0, 0.0
-            if n >= 3:
-                xx, xy, yy = xx - x * x / n, xy - x * y / n, yy - y * y / n
-                xh, yh = xh - x * h / n, yh - y * h / n
-                determinant = xx * yy - xy * xy
-                if determinant > 1e-6 * (xx + yy) ** 2:
-                    east = (yh * xy - xh * yy) / determinant
-                    north = (xh * xy - yh * xx) / determinant
-            _set_normal(normals, i, j, east, north)
+    for place in range(places.shape[1]):
+        i, j = places[0, place], places[1, place]
+        n, x, y, h, xx, xy, yy, xh, yh = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        datum = 0.0
+        for a in range(max(0, i - radius), min(rows, i + radius + 1)):
+            for b in range(max(0, j - radius), min(cols, j + radius + 1)):
+                if not math.isfinite(z[a, b]):
+                    continue
+                if n == 0:
+                    datum = z[a, b]
+                u, v, d = (b - j) * cell_x_m, (i - a) * cell_y_m, z[a, b] - datum
+                n += 1
+                x += u
+                y += v
+                h += d
+                xx += u * u
+                xy += u * v
+                yy += v * v
+                xh += u * d
+                yh += v * d
+        east, north = 0.0, 0.0
+        if n >= 3:
+            xx, xy, yy = xx - x * x / n, xy - x * y / n, yy - y * y / n
+            xh, yh = xh - x * h / n, yh - y * h / n
+            determinant = xx * yy - xy * xy
+            if determinant > 1e-6 * (xx + yy) ** 2:
+                east = (yh * xy - xh * yy) / determinant
+                north = (xh * xy - yh * xx) / determinant
+        _set_normal(normals, i, j, east, north)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
