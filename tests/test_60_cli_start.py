@@ -69,7 +69,7 @@ def test_init_writes_a_configuration_that_runs_after_three_values(tmp_path):
     text = config.read_text()
     assert "48 rows, 64 columns, 3 bands of int16; EPSG:28992" in text
     config.write_text(filled(text))
-    result = tscorr("run", config)
+    result = tscorr("run", config, "-q")
     assert (result.exit_code, result.stderr) == (0, "")
     states = specular_state(read_raster(tmp_path / "out/image/flags.tif")[0])
     assert np.count_nonzero(states == SpecularState.CORRECTED) > 100

@@ -88,8 +88,8 @@ SUN, VIEW, NORMAL = 0, 3 * CHUNK, 6 * CHUNK
 # How a pixel is assessed.
 LIT, SHADED = 1, 2
 
-BLOCK: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
-STEP: dict[str, Any] = {**BLOCK, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+BLOCK: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
+STEP: dict[str, Any] = {**BLOCK, "no_cpython_wrapper": True}
 """how `correct_block` and its steps are compiled: without reference counts, since nothing is allocated"""
 
 
@@ -107,6 +107,9 @@ class MaterialTable(NamedTuple):
     n: Any
     k: Any
     """float64 (m, bands): refractive index n - ik"""
+    fresnel: Any
+    """(m, bands, FRESNEL_DEGREE + 3): polynomial of F in x = cos_l * scale + shift, lowest power first, then scale and
+    shift; scale is 0 where the polynomial misses its bound and `fresnel` is to be taken"""
     shared: Any
     """bool (m, bands): w, n and k are those of the band before"""
     bound: Any
@@ -325,9 +328,9 @@ def new_scratch(bands: int, real: type[np.floating[Any]]) -> Scratch:
     )
 
 
-@njit(**BLOCK)
+@njit(cache=True, **BLOCK)
 def correct_block(
-    image, removed, flags, material, sun, view, normal, table, polynomials, rules, tally, scratch, options, extras=None
+    image, removed, flags, material, sun, view, normal, table, rules, tally, scratch, equations, options, extras=None
 ):
     """Take the specular part out of a block of an image, in place. Twin of reference.correct_block.
 
@@ -338,9 +341,8 @@ def correct_block(
                peak and where there are no data, since there nobody looks.
     material : uint8 (rows, cols), rows of `table`; 0 is no material.
     sun, view, normal : unit vectors, float64 (3, rows, cols), or (3, 1, 1) where constant.
-    polynomials : (materials, bands, FRESNEL_DEGREE + 3), F in x = cos_l * scale + shift: lowest power first, then
-               scale and shift; scale is 0 where the polynomial misses its bound and `fresnel` is to be taken.
-               Or None: the equations themselves at each pixel, in float64.
+    equations : True: the equations themselves at each pixel, in float64; or None: polynomials stand in for them, and
+               the equations are not even compiled.
     options  : int64 (3,): skip, first row of the block in the image, tally every so many rows.
     extras   : Extras; or None: plain subtraction of the sun's part, and nothing more is compiled.
     """
@@ -362,11 +364,11 @@ def correct_block(
             for place in range(peaks):
                 _set_rules(whole, real, table, present[place])
             _mark_known(whole)
-            assessed, hits = 0, 0
+            assessed, hits, blanks = 0, 0, 0
             if peaks > 0:
-                _aim(sun, SUN, row, start, stop, aims)
-                _aim(view, VIEW, row, start, stop, aims)
-                _aim(normal, NORMAL, row, start, stop, aims)
+                _aim(sun, row, start, stop, aims[SUN:VIEW])
+                _aim(view, row, start, stop, aims[VIEW:NORMAL])
+                _aim(normal, row, start, stop, aims[NORMAL:])
                 _set_cosines(aims, real)
                 assessed = _assess(whole, real)
             plain = True
@@ -378,7 +380,7 @@ def correct_block(
             inside = assessed > 0
             if inside:
                 tally.attenuated[0] += _set_shape(whole, real)
-                inside = _set_amounts(scratch, table, polynomials, peaks, skip, extras)
+                inside = _set_amounts(scratch, table, peaks, skip, equations, extras)
                 tally.out_of_lobe[0] += 0 if inside else assessed
             if inside:
                 _clear(whole, real)
@@ -388,7 +390,7 @@ def correct_block(
                 if extras is not None:
                     for b in range(0 if plain else bands):
                         _weigh_any(scratch, extras, peaks, image[b, row, start:stop], rules, b)
-                hits = _settle(whole)
+                hits, blanks = _settle(whole)
             if extras is not None and extras.sigma.shape[1] > 0:
                 _set_sigma(scratch, table, extras, peaks, hits, plain, image, row, start, stop, rules)
             for b in range(bands if hits > 0 else 0):
@@ -401,11 +403,10 @@ def correct_block(
                     _exchange(amounts[b], line, rules, b, extras.highest[0], whole, real)
                 if removed.shape[1] > 0:
                     _keep(amounts[b], removed[b, row, start:stop], whole)
-            if hits > 0 and _count_blanks(whole) > 0:
-                for b in range(bands):
-                    _blank(image[b, row, start:stop], nodata, whole)
-                    if extras is not None and extras.sigma.shape[1] > 0:
-                        _blank(extras.sigma[b, row, start:stop], np.float32(np.nan), whole)
+            for b in range(bands if blanks > 0 else 0):
+                _blank(image[b, row, start:stop], nodata, whole)
+                if extras is not None and extras.sigma.shape[1] > 0:
+                    _blank(extras.sigma[b, row, start:stop], np.float32(np.nan), whole)
 
             _store(marks, whole)
             for place in range(kinds):
@@ -492,10 +493,10 @@ def _mark_known(whole):
 
 
 @njit(**STEP)
-def _aim(field, place, row, start, stop, aims):
-    """Put the vectors of a chunk, which may be one for all pixels, into a place of `aims`."""
+def _aim(field, row, start, stop, aims):
+    """Put the vectors of a chunk, which may be one for all pixels, into their lines."""
     for c in range(3):
-        line = aims[place + c * CHUNK : place + (c + 1) * CHUNK]
+        line = aims[c * CHUNK : (c + 1) * CHUNK]
         if field[c].size == 1:
             value = field[c, 0, 0]
             for j in range(CHUNK):
@@ -530,7 +531,7 @@ def _set_cosines(aims, real):
         real[ALPHA2 + j] = _arccos2(real[ALPHA2 + j])
 
 
-@njit(**STEP)
+@njit(**STEP, inline="always")
 def _arccos2(u):
     """arccos(1 - u)^2."""
     high = (((A8 * u + A7) * u + A6) * u + A5) * u + A4
@@ -584,7 +585,7 @@ def _set_shape(whole, real):
 
 
 @njit(**STEP)
-def _set_amounts(scratch, table, polynomials, peaks, skip, extras):
+def _set_amounts(scratch, table, peaks, skip, equations, extras):
     """The reflectance to remove in each band; False, and none of it, if the chunk is out of every lobe.
 
     Bands with the same w, n, k share the lobe. A chunk is out of it where the largest pi beta t1 F times the
@@ -606,13 +607,7 @@ def _set_amounts(scratch, table, polynomials, peaks, skip, extras):
         for place in range(peaks):
             again |= not table.shared[present[place], b]
         if again:
-            if polynomials is None:
-                if extras is not None:
-                    _set_factors(scratch, table.w2[:, b], peaks, scattered)
-                _set_lobe_by_equations(whole, real, aims, table.w[:, b], table.n[:, b], table.k[:, b])
-                if weighted:
-                    _scale(real, LOBE, WEIGHT)
-            else:
+            if equations is None:
                 for place in range(peaks):
                     q = present[place]
                     _set_w2(whole, real, np.int32(q), table.w2[q, b])
@@ -627,7 +622,13 @@ def _set_amounts(scratch, table, polynomials, peaks, skip, extras):
                     return False
                 for place in range(peaks):
                     q = present[place]
-                    _set_lobe(whole, real, np.int32(q), polynomials[q, b], table.n[q, b], table.k[q, b])
+                    _set_lobe(whole, real, np.int32(q), table.fresnel[q, b], table.n[q, b], table.k[q, b])
+            else:
+                if extras is not None:
+                    _set_factors(scratch, table.w2[:, b], peaks, scattered)
+                _set_lobe_by_equations(whole, real, aims, table.w[:, b], table.n[:, b], table.k[:, b])
+                if weighted:
+                    _scale(real, LOBE, WEIGHT)
         for place in range(peaks):
             q = present[place]
             _set_amount(whole, real, amounts[b], np.int32(q), table.gain[q, b])
@@ -746,15 +747,16 @@ def _set_share(amounts, line, scale, offset, real):
 
 @njit(**STEP)
 def _settle(whole):
-    """SPECULAR_STATE from what `_weigh` found in all bands; the number of pixels with something to remove."""
-    hits = np.int32(0)
+    """SPECULAR_STATE from what `_weigh` found in all bands; how many pixels to correct, and of them to blank."""
+    hits, blanks = np.int32(0), np.int32(0)
     for j in range(CHUNK):
-        hit = whole[HIT + j]
+        hit, ways = whole[HIT + j], whole[WAYS + j]
         over = (whole[OVER + j] | whole[SATURATES + j]) & hit
         whole[STATE + j] |= hit + over
-        whole[TAKE + j] = np.int32((over == 0) | ((whole[WAYS + j] & (KEEP | BLANK)) == 0))
+        whole[TAKE + j] = (over == 0) | ((ways & (KEEP | BLANK)) == 0)
         hits = np.int32(hits + hit)
-    return hits
+        blanks = np.int32(blanks + np.int32((over != 0) & ((ways & BLANK) != 0)))
+    return hits, blanks
 
 
 @njit(**STEP)
@@ -795,17 +797,6 @@ def _keep(amounts, taken, whole):
     """Write down what was taken from one band."""
     for j in range(taken.size):
         taken[j] = amounts[j] if whole[HIT + j] != 0 else taken[j]
-
-
-@njit(**STEP)
-def _count_blanks(whole):
-    """The number of pixels that are to be nodata."""
-    blanks = np.int32(0)
-    for j in range(CHUNK):
-        blanks = np.int32(
-            blanks + np.int32((whole[STATE + j] == UNCORRECTABLE_STATE) & ((whole[WAYS + j] & BLANK) != 0))
-        )
-    return blanks
 
 
 @njit(**STEP)

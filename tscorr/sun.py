@@ -8,7 +8,10 @@ Within a scene directions are interpolated as vectors in the axes of the grid: c
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
+from functools import cache
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -101,7 +104,7 @@ class SunField:
         if self.is_constant:
             return self.center[:, None, None]
         instants = np.broadcast_to(0.0, block.shape)
-        return _between(np.ascontiguousarray(self.corners[:, None]), *_shares(block, self.shape), instants)
+        return _directions(np.ascontiguousarray(self.corners[:, None]), *_shares(block, self.shape), instants)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +144,7 @@ class SunTrack:
         return self._at(*_shares(block, self.shape), seconds)
 
     def _at(self, down: Array, right: Array, seconds: Array) -> Array:
-        return _between(self.knots, down, right, (seconds - self.first_s) / self.step_s)
+        return _directions(self.knots, down, right, (seconds - self.first_s) / self.step_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,12 +181,18 @@ def _shares(block: Block, shape: tuple[int, int]) -> tuple[Array, Array]:
     return down, right
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator] # numba has no types
-def _between(knots: Array, down: Array, right: Array, instants: Array) -> Array:
+def _directions(knots: Array, down: Array, right: Array, instants: Array) -> Array:
     """Unit vectors (3, rows, cols) between knots (3, times, 2, 2); `instants` (rows, cols) counts knots."""
+    result = np.empty((3, *instants.shape))
+    _between(knots, down, right, np.array(instants), result)
+    return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False)  # type: ignore[untyped-decorator] # numba has no types
+def _between(knots: Array, down: Array, right: Array, instants: Array, result: Array) -> None:
+    """`_directions` into `result`; nothing is allocated in compiled code, which halves what there is to compile."""
     height, width = instants.shape
     last = knots.shape[1] - 1
-    result = np.empty((3, height, width))
     for i in range(height):
         for j in range(width):
             time = min(max(instants[i, j], 0.0), float(last))
@@ -200,7 +209,6 @@ def _between(knots: Array, down: Array, right: Array, instants: Array) -> Array:
                 square += value * value
             for c in range(3):
                 result[c, i, j] /= math.sqrt(square)
-    return result
 
 
 def given_sun(grid: Grid, zenith_deg: float, azimuth_deg: float) -> SunField:
@@ -316,13 +324,31 @@ def solar_path(start: datetime, minutes: ArrayLike, latitude_deg: float, longitu
 
 
 def _spa(times: list[datetime], latitude_deg: float, longitude_deg: float, height_m: float) -> Array:
-    """Refracted zenith angle and azimuth (times, 2) by pvlib."""
-    import pandas as pd
-    from pvlib.solarposition import spa_python
+    """Refracted zenith angle and azimuth (times, 2) by pvlib's implementation of the algorithm.
 
-    when = pd.DatetimeIndex([time.astimezone(UTC) for time in times])
-    table = spa_python(when, latitude_deg, longitude_deg, altitude=height_m)
-    return np.asarray(table[["apparent_zenith", "azimuth"]], dtype=float)
+    As pvlib.solarposition.spa_python has it by default: 1013.25 hPa, 12 °C, 0.5667 degrees of refraction at the
+    horizon, and 67 s between terrestrial and universal time.
+    """
+    seconds = np.array([time.timestamp() for time in times])
+    place = latitude_deg, longitude_deg, height_m
+    zenith, _, _, _, azimuth, _ = _algorithm().solar_position(
+        seconds, *place, 1013.25, 12.0, 67.0, 0.5667, numthreads=1
+    )
+    return np.stack([zenith, azimuth], axis=1)
+
+
+@cache
+def _algorithm() -> Any:
+    """The module pvlib.spa alone: the package would load scipy and pandas, a second of each start."""
+    package = find_spec("pvlib")
+    assert package is not None
+    assert package.origin is not None
+    spec = spec_from_file_location("tscorr.pvlib_spa", Path(package.origin).with_name("spa.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def _require_above_horizon(zenith_deg: float, what: str) -> None:

@@ -1,6 +1,7 @@
 """What the commands share: one way to fail, arguments that several take, tables on the terminal."""
 
 import functools
+import gc
 import logging
 import signal
 import sys
@@ -62,6 +63,30 @@ def with_clear_errors(command: Callable[..., Any]) -> Callable[..., Any]:
             sys.exit(SIGNALLED + number)
 
     return wrapped
+
+
+COMPILING = "tscorr: compiling for this machine, once: 10 to 20 s"
+
+
+@contextmanager
+def compilation_told(*, enabled: bool = True) -> Iterator[None]:
+    """One line on stderr when the first function is compiled; what an earlier run has compiled is not.
+
+    From then on the garbage collector leaves alone what there was: the modules, which stay, and which it would search
+    again and again while numba makes its many objects, for a fifth of the time.
+    """
+    from numba.core.event import RecordingListener, install_listener
+
+    class Teller(RecordingListener):  # type: ignore[misc] # numba has no types
+        def on_start(self, event: object) -> None:
+            if not self.buffer:
+                gc.freeze()
+                if enabled:
+                    click.echo(COMPILING, err=True)
+            super().on_start(event)
+
+    with install_listener("numba:compile", Teller()):
+        yield
 
 
 config_argument = click.argument("config", type=click.Path(exists=True, dir_okay=False, path_type=Path))

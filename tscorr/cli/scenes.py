@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tscorr.cli.common import config_argument, percent, print_table, with_clear_errors
+from tscorr.cli.common import compilation_told, config_argument, percent, print_table, with_clear_errors
 from tscorr.errors import TscorrError
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def run(
     """Correct the scenes of CONFIG; scenes whose result is current are left as they are."""
     from tscorr import batch
 
-    with progress_bars(enabled=not quiet and sys.stderr.isatty()) as progress:
+    with compilation_told(enabled=not quiet), progress_bars(enabled=not quiet and sys.stderr.isatty()) as progress:
         result = batch.run(
             config,
             scenes=scenes,

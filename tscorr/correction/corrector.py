@@ -14,7 +14,6 @@ from tscorr.correction.rules import Stored
 from tscorr.correction.tables import (
     Entry,
     computed_precision,
-    fresnel_polynomials,
     material_table,
     new_tally,
     pixel_rules,
@@ -83,8 +82,6 @@ class _Engine:
 
     precision: str
     table: kernels.MaterialTable
-    polynomials: Array | None
-    """of the Fresnel reflectance, where they stand in for the equations"""
     mine: Array
     """bool (materials,): which rows of the table are its own"""
     extras: kernels.Extras | None
@@ -132,8 +129,7 @@ class Corrector:
         table = material_table(materials, len(stored.scale), real)
         extras = extras_table(materials, stored, real) if self._asked else None
         peak = table.peak if extras is None else table.peak | extras.has_sky
-        polynomials = fresnel_polynomials(materials, len(stored.scale)) if precision == "fast" else None
-        return _Engine(precision, table._replace(peak=peak & mine), polynomials, mine, extras)
+        return _Engine(precision, table._replace(peak=peak & mine), mine, extras)
 
     @property
     def peaks(self) -> Array:
@@ -204,15 +200,17 @@ class Corrector:
             np.ascontiguousarray(inputs.view, np.float64),
             np.ascontiguousarray(inputs.normal, np.float64),
             engine.table,
+            self._pixels[np.dtype(real)],
+            results.tally,
         )
-        rules, tally = self._pixels[np.dtype(real)], results.tally
         options = np.array([self.skip, first_row, self.tally_stride], dtype=np.int64)
         extras = None if engine.extras is None else _of_block(engine.extras, inputs, results.sigma)
         if engine.precision == "reference":
-            reference.correct_block(*block, rules, tally, options, extras)
+            reference.correct_block(*block, options, extras)
         else:
             scratch = kernels.new_scratch(len(inputs.image), real)
-            kernels.correct_block(*block, engine.polynomials, rules, tally, scratch, options, extras)
+            equations = True if engine.precision == "exact" else None
+            kernels.correct_block(*block, scratch, equations, options, extras)
 
 
 @dataclass(frozen=True, slots=True)

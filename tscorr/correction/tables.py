@@ -77,16 +77,6 @@ def material_table(materials: Sequence[Entry], bands: int, real: type[np.floatin
     return kernels.MaterialTable(**columns)
 
 
-def fresnel_polynomials(materials: Sequence[Entry], bands: int) -> Array:
-    """`fresnel_polynomial` of each material and band: float32 (materials + 1, bands, FRESNEL_DEGREE + 3)."""
-    polynomials = np.zeros((len(materials) + 1, bands, kernels.FRESNEL_DEGREE + 3), np.float32)
-    for row, (surface, parameters, rules) in enumerate(materials, start=1):
-        steepest = steepest_deg(surface, rules)
-        for band, (n, k) in enumerate(zip(parameters.n, parameters.k, strict=True)):
-            polynomials[row, band] = fresnel_polynomial(n, k, steepest)
-    return polynomials
-
-
 def _material_row(surface: Material, parameters: BandParameters, rules: Rules, bands: int) -> dict[str, Any]:
     if len(parameters.t0) != bands or len(rules.direct_fraction) not in {1, bands}:
         raise InputError(
@@ -101,6 +91,7 @@ def _material_row(surface: Material, parameters: BandParameters, rules: Rules, b
         values = getattr(parameters, key)
         shared[1:] |= values[1:] != values[:-1]
     shared = ~shared & (np.arange(bands) > 0)
+    fits = [fresnel_polynomial(n, k, steepest) for n, k in zip(parameters.n, parameters.k, strict=True)]
     cos_steepest = _cosine(steepest)
     return {
         "peak": bool(rules.enabled and np.any(gain > 0)),
@@ -109,6 +100,7 @@ def _material_row(surface: Material, parameters: BandParameters, rules: Rules, b
         "w2": np.rad2deg(parameters.w) ** 2,
         "n": parameters.n,
         "k": parameters.k,
+        "fresnel": fits,
         "shared": shared,
         "bound": float(np.max(gain * _fresnel_bound(parameters.n, parameters.k, cos_steepest))),
         "one_w": bool(np.all(parameters.w == parameters.w[0])),

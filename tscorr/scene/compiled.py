@@ -1,13 +1,11 @@
 """A loop over pixels that numpy is slow at: how often each value of a mask stands there."""
 
-import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def counts_of(flags):
-    """Pixels with each value of uint16 flags (rows, cols): int64 (65536,)."""
-    counts = np.zeros(1 << 16, np.int64)
+@njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False)
+def count_values(flags, counts):
+    """Add to `counts`, int64 (65536,), the pixels with each value of uint16 flags (rows, cols)."""
     for i in range(flags.shape[0]):
         value, run = flags[i, 0], 0
         for j in range(flags.shape[1]):  # values stand in runs: they are counted without the memory
@@ -17,4 +15,3 @@ def counts_of(flags):
                 counts[value] += run
                 value, run = flags[i, j], 1
         counts[value] += run
-    return counts

@@ -51,7 +51,9 @@ class LaidVectors:
             return np.zeros((3, *block.shape))
         source = np.ascontiguousarray(self._vectors_of(*self._values(window)), np.float64)
         turn = np.ascontiguousarray(self._north_of(grid).turn(block))
-        return bilinear_unit(source, rows - window.row, cols - window.col, turn)
+        result = np.zeros((3, *rows.shape))
+        bilinear_unit(source, rows - window.row, cols - window.col, turn, result)
+        return result
 
     def sample(self, most: int) -> list[Array]:
         """Values of each band at up to most x most pixels, nan where void."""

@@ -76,9 +76,10 @@ class Sums:
 
     def add(self, result: BlockResult, rows: Array, kind: str | None) -> None:
         """Add a block of these rows of the corrector; `kind` says why most of its work was skipped, if it was."""
-        from tscorr.scene.compiled import counts_of
+        from tscorr.scene.compiled import count_values
 
-        counts = counts_of(result.flags)
+        counts = np.zeros(1 << 16, np.int64)
+        count_values(result.flags, counts)
         with self._lock:
             add_tally(self.tally, result.tally)
             self.flags += counts

@@ -1,27 +1,38 @@
 """Loops over pixels that numpy is slow at: towards a camera, when a scanner passed, vectors between raster pixels.
 
-Each result depends on its own pixel only, so it is the same however a scene is cut into blocks.
+Each result depends on its own pixel only, so it is the same however a scene is cut into blocks. Nothing is
+allocated in compiled code, results and scratch memory are given to it: that halves what there is to compile.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
+
+PART: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "_nrt": False,
+    "no_cfunc_wrapper": True,
+    "no_cpython_wrapper": True,
+}
+LOOP: dict[str, Any] = {**PART, "no_cpython_wrapper": False, "cache": True}
+"""compiled without reference counts; parts are called from loops only"""
 
 TILE = 16
 """pixels of a side of the tiles for which the possible samples are listed"""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def towards(position, heights, transform, first_row, first_col, shape):
-    """Unit vectors (3, rows, cols) from the pixels of a block to one position.
+@njit(**LOOP)
+def towards(position, heights, transform, first_row, first_col, vectors):
+    """Unit vectors (3, rows, cols) from the pixels of a block to one position, into `vectors`.
 
     position  : (3,). heights : (rows, cols), or (1, 1) where constant. [m]
     transform : (6,), of the grid: x = t[0] (col + 1/2) + t[1] (row + 1/2) + t[2], y with t[3:].
-    shape     : (rows, cols), whose first pixel is (first_row, first_col) of the grid.
+    The first pixel is (first_row, first_col) of the grid.
     """
-    rows, cols = shape
-    vectors = np.empty((3, rows, cols))
+    rows, cols = vectors.shape[1:]
     constant = heights.size == 1
     for i in range(rows):
         row = first_row + i + 0.5
@@ -39,14 +50,12 @@ def towards(position, heights, transform, first_row, first_col, shape):
             east[j] = x * inverse
             north[j] = y * inverse
             up[j] *= inverse
-    return vectors
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def passes(x, y, z, seconds, table, candidates):
+def passes(points: Any, seconds: Any, table: Any, candidates: Any) -> tuple[Any, Any]:
     """When the scan plane of a trajectory went over each point, and where the sensor was: the nearest pass.
 
-    x, y, z    : float64 (rows, cols), points on the ground. [m]
+    points     : float64 (3, rows, cols), on the ground. [m]
     seconds    : (samples,), ascending.
     table      : (samples, 6), position and forward vector at each sample; linear in between.
     candidates : int64, ascending: samples k such that the plane may pass a point between k and k + 1.
@@ -54,28 +63,33 @@ def passes(x, y, z, seconds, table, candidates):
     A plane passes a point when the point, ahead of it at sample k, is behind it or on it at k + 1.
     Returns seconds (rows, cols), nan where no plane passes, and unit vectors (3, rows, cols), there up.
     """
-    rows, cols = x.shape
-    when = np.empty((rows, cols))
-    vectors = np.empty((3, rows, cols))
-    near = np.empty(candidates.size, np.int64)
-    points = np.empty((3, TILE * TILE))
-    before, now, count = np.empty(TILE * TILE), np.empty(TILE * TILE), np.empty(TILE * TILE, np.int64)
-    passed = np.empty(TILE * TILE, np.int64)
+    when, vectors, near = np.empty(points.shape[1:]), np.empty(points.shape), np.empty(candidates.size, np.int64)
+    tile, ahead, counts = np.empty((3, TILE**2)), np.empty((2, TILE**2)), np.empty((2, TILE**2), np.int64)
+    pass_tiles(points, seconds, table, candidates, when, vectors, near, tile, ahead, counts)
+    return when, vectors
+
+
+@njit(**LOOP)
+def pass_tiles(points, seconds, table, candidates, when, vectors, near, tile, ahead, counts):
+    """`passes` into `when` and `vectors`, tile by tile; the rest is scratch."""
+    rows, cols = when.shape
+    count, passed = counts[0], counts[1]
     for top in range(0, rows, TILE):
         for left in range(0, cols, TILE):
             bottom, right = min(top + TILE, rows), min(left + TILE, cols)
-            size = 0
+            p, size = 0, (bottom - top) * (right - left)
             for i in range(top, bottom):
                 for j in range(left, right):
-                    points[0, size], points[1, size], points[2, size] = x[i, j], y[i, j], z[i, j]
-                    size += 1
-            nears = _near_samples(points, size, table, candidates, near)
-            _count_passes(points, size, table, near, nears, (before, now, count, passed))
+                    for c in range(3):
+                        tile[c, p] = points[c, i, j]
+                    p += 1
+            nears = _near_samples(tile, size, table, candidates, near)
+            _count_passes(tile, size, table, near, nears, ahead, counts)
             p = 0
             for i in range(top, bottom):
                 for j in range(left, right):
                     found = (math.nan, 0.0, 0.0, 1.0)
-                    point = (x[i, j], y[i, j], z[i, j])
+                    point = (tile[0, p], tile[1, p], tile[2, p])
                     if count[p] == 1:
                         found = _seen(point, seconds, table, passed[p])[:4]
                     elif count[p] > 1:
@@ -83,20 +97,13 @@ def passes(x, y, z, seconds, table, candidates):
                     when[i, j] = found[0]
                     vectors[0, i, j], vectors[1, i, j], vectors[2, i, j] = found[1], found[2], found[3]
                     p += 1
-    return when, vectors
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**PART)
 def _near_samples(points, size, table, candidates, near):
     """The candidates whose planes may pass the box around the first points of a tile, into `near`; how many."""
-    middle, half = np.empty(3), np.empty(3)
-    for c in range(3):
-        low, high = points[c, 0], points[c, 0]
-        for p in range(size):
-            value = points[c, p]
-            low = value if value < low else low
-            high = value if value > high else high
-        middle[c], half[c] = (low + high) / 2, (high - low) / 2 + 1e-6
+    (x, east), (y, north), (z, up) = _box(points[0], size), _box(points[1], size), _box(points[2], size)
+    middle, half = (x, y, z), (east, north, up)
     count = 0
     for k in candidates:
         if _ahead(middle, table, k) + _reach(half, table, k) <= 0:
@@ -108,10 +115,21 @@ def _near_samples(points, size, table, candidates, near):
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _count_passes(points, size, table, near, nears, scratch):
-    """How often each point of a tile is passed, and after which sample the last time."""
-    before, now, count, passed = scratch
+@njit(**PART)
+def _box(values, size):
+    """Middle of the first values, and half of their range and a little more."""
+    low, high = values[0], values[0]
+    for p in range(size):
+        value = values[p]
+        low = value if value < low else low
+        high = value if value > high else high
+    return (low + high) / 2, (high - low) / 2 + 1e-6
+
+
+@njit(**PART)
+def _count_passes(points, size, table, near, nears, ahead, counts):
+    """How often each point of a tile is passed, and after which sample the last time, into `counts`."""
+    before, now, count, passed = ahead[0], ahead[1], counts[0], counts[1]
     for p in range(size):
         count[p] = 0
     last = -1
@@ -128,7 +146,7 @@ def _count_passes(points, size, table, near, nears, scratch):
             before[p] = now[p]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**PART)
 def _ahead_of_all(points, size, table, k, ahead):
     """`_ahead` of the first points of a tile, in the same order of arithmetic."""
     x, y, z = table[k, 0], table[k, 1], table[k, 2]
@@ -137,7 +155,7 @@ def _ahead_of_all(points, size, table, k, ahead):
         ahead[p] = (points[0, p] - x) * east + (points[1, p] - y) * north + (points[2, p] - z) * up
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**PART)
 def _ahead(point, table, k):
     """How far a point lies ahead of the scan plane of sample k. [m]"""
     return (
@@ -147,13 +165,13 @@ def _ahead(point, table, k):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**PART)
 def _reach(half, table, k):
     """How much farther ahead than its middle a box of these half sides reaches. [m]"""
     return half[0] * abs(table[k, 3]) + half[1] * abs(table[k, 4]) + half[2] * abs(table[k, 5])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**PART)
 def _nearest_pass(point, seconds, table, near, nears):
     """`_seen` of the pass over a point that was nearest; of the earliest, where two were equally near."""
     found, least = (math.nan, 0.0, 0.0, 1.0), math.inf
@@ -166,7 +184,7 @@ def _nearest_pass(point, seconds, table, near, nears):
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**PART)
 def _seen(point, seconds, table, k):
     """When a point was passed between samples k and k + 1, the unit vector to the sensor then, and its distance.
 
@@ -187,20 +205,19 @@ def _seen(point, seconds, table, k):
     return time, east / distance, north / distance, up / distance, distance
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def bilinear_unit(source, rows, cols, turn):
+@njit(**LOOP)
+def bilinear_unit(source, rows, cols, turn, result):
     """Unit vectors between the pixels of a raster of vectors, turned from true north to the grid's axes.
 
     source     : float64 (3, rows, cols), unit vectors east, north, up; of length 0 where there is none.
     rows, cols : (height, width), fractional places in `source`; the centre of its first pixel is (0, 0).
     turn       : (2, height, width), sine and cosine of the meridian convergence.
 
-    Up to half a pixel outside the outer centres the outer pixel holds. Returns (3, height, width), of length 0
-    where no vector is near: outside, and where less than a quarter of the weight falls on pixels that have one.
+    result     : (3, height, width), zeros on entry, which stay where no vector is near: where less than a quarter
+                 of the weight falls on pixels that have one. Up to half a pixel outside, the outer pixel holds.
     """
     last_row, last_col = source.shape[1] - 1, source.shape[2] - 1
     height, width = rows.shape
-    result = np.zeros((3, height, width))
     for i in range(height):
         for j in range(width):
             row, col = rows[i, j], cols[i, j]
@@ -224,4 +241,3 @@ def bilinear_unit(source, rows, cols, turn):
             result[0, i, j] = (east * cosine - north * sine) / length
             result[1, i, j] = (east * sine + north * cosine) / length
             result[2, i, j] = up / length
-    return result

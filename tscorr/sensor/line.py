@@ -72,8 +72,8 @@ class LineView(View):
         from tscorr.sensor.compiled import passes
 
         shape = np.broadcast_shapes(x.shape, y.shape, z.shape)
-        x, y, z = (np.ascontiguousarray(np.broadcast_to(values, shape), np.float64) for values in (x, y, z))
-        return passes(x, y, z, self.path.seconds, self._samples, self._candidates(x, y, z))
+        points = np.stack([np.broadcast_to(values, shape).astype(np.float64) for values in (x, y, z)])
+        return passes(points, self.path.seconds, self._samples, self._candidates(*points))
 
     def _candidates(self, x: Array, y: Array, z: Array) -> Array:
         """Samples k such that the scan plane may go over one of the points between k and k + 1."""

@@ -103,7 +103,9 @@ class FrameView(View):
         from tscorr.sensor.compiled import towards
 
         transform, position = np.array(grid.transform[:6]), np.array(self.position)
-        return Look(towards(position, np.ascontiguousarray(heights), transform, block.row, block.col, block.shape))
+        vectors = np.empty((3, *block.shape))
+        towards(position, np.array(heights, np.float64, order="C"), transform, block.row, block.col, vectors)
+        return Look(vectors)
 
     def check(self, grid: Grid, highest_m: float) -> None:
         """The camera must be above the highest point of the scene, and not beyond its horizon."""

@@ -7,9 +7,15 @@ labels  : int32 (rows, cols), the face of each pixel, 0 = none
 planes  : (faces, 5), rise a column, rise a row, and a point: column, row, height above datum
 moments : (faces, 10), sums over a face's pixels of 1 x y h xx xy yy xh yh hh, x the column, y the row
 sigma   : standard deviation of the heights' noise; `tolerance`, `step` are heights too
+fits    : float32 (rows, cols, 3) and (rows, cols), a plane about each pixel (rise a column, rise a row, height above
+          datum) and the rms of the heights about it, inf where there is none
+border  : flat indices of the pixels beside another face
+
+Nothing is allocated here, results and scratch memory are given: that halves what there is to compile.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -22,9 +28,19 @@ OUTLIER_COST = 8.0  # chi-square / 2, a residual of 4 sigma: dearer than any pla
 NEIGHBOUR_COST = 0.5  # of each of the 8 neighbours that has another label; chi-square / 2
 MERGE_CHI2 = 16.3  # exceeded by 0.1 % of chi-square with 3 degrees of freedom
 CLEAR_MEETING = 0.5  # of 1: how clearly two faces must show a ridge or a valley
+SEED_CLASSES = 64  # of rms, in which faces grow one after the other
+
+_PART: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "_nrt": False,
+    "no_cfunc_wrapper": True,
+    "no_cpython_wrapper": True,
+}
+_LOOP: dict[str, Any] = {**_PART, "no_cpython_wrapper": False, "cache": True}
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**_PART)
 def _add(moments, x, y, h):
     moments[0] += 1.0
     moments[1] += x
@@ -38,7 +54,7 @@ def _add(moments, x, y, h):
     moments[9] += h * h
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**_PART)
 def _centred(moments):
     """Centred second moments: xx, xy, yy, xh, yh, hh."""
     n = moments[0]
@@ -53,7 +69,7 @@ def _centred(moments):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**_PART)
 def _solve(moments, plane):
     """Set the least-squares plane of the pixels; False, and no plane, if they are in a line."""
     xx, xy, yy, xh, yh, _ = _centred(moments)
@@ -68,7 +84,7 @@ def _solve(moments, plane):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**_PART)
 def _misfit(moments):
     """Sum of squared residuals from the least-squares plane of the pixels."""
     xx, xy, yy, xh, yh, hh = _centred(moments)
@@ -78,22 +94,19 @@ def _misfit(moments):
     return max(hh - (xh * xh * yy - 2.0 * xh * yh * xy + yh * yh * xx) / determinant, 0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**_PART)
 def _height(plane, col, row):
     return plane[4] + plane[0] * (col - plane[2]) + plane[1] * (row - plane[3])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def window_fits(z, datum):
-    """Least-squares planes of all full windows: (rise a column, rise a row, height - datum), and rms."""
+@njit(**_LOOP)
+def window_fits(z, datum, tilts, rms, sums):
+    """Least-squares planes of all full windows into fits `tilts`, `rms`; `sums` is (3, cols) of scratch."""
     radius, (rows, cols) = SEED_RADIUS, z.shape
-    tilts = np.zeros((rows, cols, 3), np.float32)
-    rms = np.full((rows, cols), np.inf, np.float32)
     n = (2 * radius + 1) ** 2
     spread = n * radius * (radius + 1) / 3.0  # sum of squared offsets
-    sums = np.zeros((3, cols))  # down each column of the window: height, offset * height, height^2
     for i in range(radius, rows - radius):
-        sums[:] = 0.0
+        sums[:] = 0.0  # down each column of the window: height, offset * height, height^2
         for a in range(-radius, radius + 1):
             for j in range(cols):
                 d = z[i + a, j] - datum
@@ -113,19 +126,16 @@ def window_fits(z, datum):
                 tilts[i, j, 1] = by_row / spread
                 tilts[i, j, 2] = total / n
                 rms[i, j] = math.sqrt(max(rest, 0.0) / (n - 3))
-    return tilts, rms
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def free_fits(z, datum, labels, step):
+@njit(**_LOOP)
+def free_fits(z, datum, labels, step, tilts, rms, moments, plane):
     """As `window_fits`, for what is left: 3 x 3 around free pixels (label 0), of free pixels only.
 
-    Neighbours farther in height than `step` are on another surface; LEAST_PX must be left.
+    Neighbours farther in height than `step` are on another surface; LEAST_PX must be left. `moments` and `plane`
+    of one face are scratch.
     """
     rows, cols = z.shape
-    tilts = np.zeros((rows, cols, 3), np.float32)
-    rms = np.full((rows, cols), np.inf, np.float32)
-    moments, plane = np.zeros(10), np.zeros(5)
     for i in range(rows):
         for j in range(cols):
             if labels[i, j] != 0:
@@ -139,40 +149,26 @@ def free_fits(z, datum, labels, step):
                 tilts[i, j, 0], tilts[i, j, 1] = plane[0], plane[1]
                 tilts[i, j, 2] = _height(plane, 0, 0)
                 rms[i, j] = math.sqrt(_misfit(moments) / (moments[0] - 3.0))
-    return tilts, rms
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _best_first(rms, limit):
-    """Flat indices of the pixels with rms < limit, by 64 steps of rms, then in row order."""
-    steps = 64
-    start = np.zeros(steps + 1, np.int64)
-    flat = rms.ravel()
-    for p in range(flat.size):
-        if flat[p] < limit:
-            start[int(flat[p] / limit * steps) + 1] += 1
-    start = np.cumsum(start)
-    order = np.empty(start[steps], np.int32)
-    for p in range(flat.size):
-        if flat[p] < limit:
-            step = int(flat[p] / limit * steps)
-            order[start[step]] = p
-            start[step] += 1
-    return order
+def best_first(rms, sigma):
+    """Flat indices of the pixels that may be seeds, by classes of rms, then in row order."""
+    flat, limit = rms.ravel(), SEED_RMS * sigma
+    seeds = np.flatnonzero(flat < limit)
+    classes = (flat[seeds] / np.float64(limit) * SEED_CLASSES).astype(np.uint8)
+    return seeds[np.argsort(classes, kind="stable")]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def grow(z, datum, labels, fits, sigma, tolerance, first_fit, label):
+@njit(**_LOOP)
+def grow(z, datum, labels, tilts, seeds, tolerance, first_fit, label, queue, moments, plane):
     """Spread planes from seeds, best first, over free neighbours (label 0) that fit: next free label.
 
-    `fits` are those of `window_fits` or `free_fits`. A face's plane is fitted again when it has
-    `first_fit` pixels and each time it has doubled.
+    `tilts` are those of `window_fits` or `free_fits`. A face's plane is fitted again when it has
+    `first_fit` pixels and each time it has doubled. `queue`, int32 ((2 REACH_PX + 1)^2,), `moments` and `plane`
+    are scratch.
     """
     rows, cols = z.shape
-    tilts, rms = fits
-    queue = np.empty((2 * REACH_PX + 1) ** 2, np.int32)
-    moments, plane = np.zeros(10), np.zeros(5)
-    for seed in _best_first(rms, SEED_RMS * sigma):
+    for seed in seeds:
         row, col = seed // cols, seed % cols
         plane[0], plane[1], plane[2], plane[3] = tilts[row, col, 0], tilts[row, col, 1], col, row
         plane[4] = tilts[row, col, 2]
@@ -207,10 +203,9 @@ def grow(z, datum, labels, fits, sigma, tolerance, first_fit, label):
     return label
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def face_moments(z, datum, labels, planes, tolerance):
-    """Moments of each face's pixels that lie within `tolerance` of its plane; inf takes all."""
-    moments = np.zeros((len(planes), 10))
+@njit(**_LOOP)
+def add_moments(z, datum, labels, planes, tolerance, moments):
+    """Add to the moments of each face its pixels that lie within `tolerance` of its plane; inf takes all."""
     for i in range(z.shape[0]):
         for j in range(z.shape[1]):
             label = labels[i, j]
@@ -218,10 +213,9 @@ def face_moments(z, datum, labels, planes, tolerance):
                 h = z[i, j] - datum
                 if tolerance == math.inf or abs(h - _height(planes[label], j, i)) < tolerance:
                     _add(moments[label], j, i, h)
-    return moments
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**_LOOP)
 def fit_planes(moments, planes):
     """Fit the plane of each face; a face with too few pixels, or pixels in a line, keeps the one it had."""
     for label in range(1, len(moments)):
@@ -229,7 +223,7 @@ def fit_planes(moments, planes):
             _solve(moments[label], planes[label])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**_PART)
 def _root(parent, label):
     while parent[label] != label:
         parent[label] = parent[parent[label]]
@@ -237,11 +231,13 @@ def _root(parent, label):
     return label
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def merge(labels, moments, sigma):
-    """Join touching pieces that one plane fits as well as two; changes labels and moments."""
+@njit(**_LOOP)
+def merge(labels, moments, sigma, parent, both):
+    """Join touching pieces that one plane fits as well as two; changes labels and moments.
+
+    parent : int64 (faces,), each face its own on entry; both : scratch for the moments of one face.
+    """
     rows, cols = labels.shape
-    parent = np.arange(len(moments))
     for i in range(rows):
         for j in range(cols):
             for a, b in ((i, j + 1), (i + 1, j)):
@@ -252,50 +248,43 @@ def merge(labels, moments, sigma):
                 first, second = _root(parent, labels[i, j]), _root(parent, labels[a, b])
                 if first == second:
                     continue
-                both = moments[first] + moments[second]
+                for m in range(both.size):
+                    both[m] = moments[first, m] + moments[second, m]
                 worse = _misfit(both) - _misfit(moments[first]) - _misfit(moments[second])
                 if worse < MERGE_CHI2 * sigma * sigma:
                     keep, drop = min(first, second), max(first, second)
                     parent[drop] = keep
-                    moments[keep] = both
-                    moments[drop] = 0.0
+                    for m in range(both.size):
+                        moments[keep, m], moments[drop, m] = both[m], 0.0
     for i in range(rows):
         for j in range(cols):
             if labels[i, j] > 0:
                 labels[i, j] = _root(parent, labels[i, j])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _border(labels):
+def border(labels):
     """Flat indices of the pixels that have an 8-neighbour with another label, in row order."""
-    rows, cols = labels.shape
-    border = np.empty(rows * cols, np.int32)
-    different = np.empty(cols, np.bool_)
-    found = 0
-    for i in range(rows):
-        here = labels[i]
-        different[:] = False
-        for a in range(max(0, i - 1), min(rows, i + 2)):
-            beside = labels[a]
-            for j in range(cols):
-                different[j] |= beside[j] != here[j]
-            for j in range(1, cols):
-                different[j] |= beside[j - 1] != here[j]
-            for j in range(cols - 1):
-                different[j] |= beside[j + 1] != here[j]
-        for j in range(cols):
-            if different[j]:
-                border[found] = i * cols + j
-                found += 1
-    return border[:found].copy()
+    beside = np.zeros(labels.shape, np.bool_)
+    for here, there in (
+        (np.s_[1:], np.s_[:-1]),
+        (np.s_[:, 1:], np.s_[:, :-1]),
+        (np.s_[1:, 1:], np.s_[:-1, :-1]),
+        (np.s_[1:, :-1], np.s_[:-1, 1:]),
+    ):
+        different = labels[here] != labels[there]
+        beside[here] |= different
+        beside[there] |= different
+    return np.flatnonzero(beside)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def relabel(z, datum, labels, planes, sigma):
-    """One sweep: each pixel at a border takes the neighbouring face of least cost, or none (0)."""
+@njit(**_LOOP)
+def relabel(z, datum, labels, planes, sigma, border, near, votes):
+    """One sweep: each pixel at a border takes the neighbouring face of least cost, or none (0).
+
+    near, votes : int32 (8,), scratch.
+    """
     rows, cols = z.shape
-    near, votes = np.zeros(8, np.int32), np.zeros(8, np.int32)
-    for pixel in _border(labels):
+    for pixel in border:
         i, j = pixel // cols, pixel % cols
         if not math.isfinite(z[i, j]):
             continue
@@ -320,7 +309,7 @@ def relabel(z, datum, labels, planes, sigma):
                 labels[i, j], least = near[k], cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**_PART)
 def _valley(labels, planes, own, other, i, j, limit):
     """How two faces meet near a pixel, from -1 (ridge: the surface is the lower plane) to 1 (valley)."""
     middle = _height(planes[own], j, i) - _height(planes[other], j, i)
@@ -335,16 +324,15 @@ def _valley(labels, planes, own, other, i, j, limit):
     return valley / total if total > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def resolve(z, datum, labels, planes, sigma, tolerance):
-    """Labels after settling the pixels that lie on the planes of two faces by how the faces meet.
+@njit(**_LOOP)
+def resolve(z, datum, labels, planes, sigma, tolerance, border, settled):
+    """Into `settled`, a copy of the labels: the pixels on the planes of two faces settled by how the faces meet.
 
     In the 5 x 5 pixels around, each face shows whether it is the lower of the two planes where it
     lives (ridge) or the higher (valley); then the two planes, not the noisy height, decide.
     """
     rows, cols = z.shape
-    settled = labels.copy()
-    for pixel in _border(labels):
+    for pixel in border:
         i, j = pixel // cols, pixel % cols
         own = labels[i, j]
         if own == 0:
@@ -365,15 +353,13 @@ def resolve(z, datum, labels, planes, sigma, tolerance):
                 valley = _valley(labels, planes, own, other, i, j, tolerance)
                 if abs(valley) > CLEAR_MEETING and valley * gap < 0.0:
                     settled[i, j] = other
-    return settled
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def undecided(labels, planes, limit, tilt, cell_x_m, cell_y_m):
-    """Pixels within `limit` of the plane of a neighbouring face whose slope differs by more than `tilt`."""
+@njit(**_LOOP)
+def mark_undecided(labels, planes, limit, tilt, cell_x_m, cell_y_m, border, result):
+    """Set pixels within `limit` of the plane of a neighbouring face whose slope differs by more than `tilt`."""
     rows, cols = labels.shape
-    result = np.zeros((rows, cols), np.bool_)
-    for pixel in _border(labels):
+    for pixel in border:
         i, j = pixel // cols, pixel % cols
         own = planes[labels[i, j]]
         for a in range(max(0, i - 1), min(rows, i + 2)):
@@ -384,14 +370,12 @@ def undecided(labels, planes, limit, tilt, cell_x_m, cell_y_m):
                 apart = math.hypot((own[0] - other[0]) / cell_x_m, (own[1] - other[1]) / cell_y_m)
                 gap = abs(_height(own, j, i) - _height(other, j, i))
                 result[i, j] |= apart > tilt and gap < limit
-    return result
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def adopt(z, datum, labels, planes):
-    """Labels in which pixels on no face take the face in 5 x 5 whose plane is nearest in height."""
+@njit(**_LOOP)
+def adopt(z, datum, labels, planes, adopted):
+    """Into `adopted`, a copy of the labels: pixels on no face take the face in 5 x 5 whose plane is nearest."""
     rows, cols = z.shape
-    adopted = labels.copy()
     for i in range(rows):
         for j in range(cols):
             if labels[i, j] != 0 or not math.isfinite(z[i, j]):
@@ -403,4 +387,3 @@ def adopt(z, datum, labels, planes):
                         distance = abs(z[i, j] - datum - _height(planes[labels[a, b]], j, i))
                         if distance < nearest:
                             nearest, adopted[i, j] = distance, labels[a, b]
-    return adopted

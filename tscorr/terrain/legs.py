@@ -134,6 +134,7 @@ class ParallelLeg(Leg):
             heights,
             visible,
             self._rays,
+            *_scratch(self.axes, heights),
             transposed=self.axes.transposed,
             backwards=self.axes.backwards,
             first=first,
@@ -179,6 +180,7 @@ class FanLeg(Leg):
             heights,
             visible,
             self._rays,
+            *_scratch(self.axes, heights),
             self._tangents,
             self._walls_m,
             transposed=self.axes.transposed,
@@ -191,6 +193,12 @@ class FanLeg(Leg):
             wall_across=sightlines.WALL_SLOPE * self.axes.pixel_m,
             tolerance=tolerance_m,
         )
+
+
+def _scratch(axes: Axes, heights: Heights) -> tuple[NDArray[np.float32], Mask]:
+    """Memory for one line of heights, and for what is seen of it."""
+    width = heights.shape[0 if axes.transposed else 1]
+    return np.empty(width + 2, np.float32), np.ones(width, np.bool_)
 
 
 def _tangents(axes: Axes, nadir: tuple[float, float], first: int) -> NDArray[np.float64]:

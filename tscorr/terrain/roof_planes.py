@@ -100,11 +100,13 @@ def roof_planes(heights: Array, *, cell_x_m: float, cell_y_m: float, noise_m: fl
 
     labels, planes, moments = _find_faces(z, datum, sigma, ROOF_SLOPE * cell_m)
     tilt = math.tan(math.radians(FORK_TILT_DEG))
-    fork = faces.undecided(labels, planes, FORK_SIGMA * sigma, tilt, cell_x_m, cell_y_m)
+    fork = np.zeros(z.shape, np.bool_)
+    faces.mark_undecided(labels, planes, FORK_SIGMA * sigma, tilt, cell_x_m, cell_y_m, faces.border(labels), fork)
     small = moments[:, 0] < TRUSTED_FACE_PX  # and so is face 0, which has no pixels
     normals = _face_normals(planes, cell_x_m, cell_y_m)
     sigma_deg = _face_sigma_deg(moments, normals, sigma, cell_x_m, cell_y_m)
-    adopted = faces.adopt(z, datum, labels, planes)
+    adopted = labels.copy()
+    faces.adopt(z, datum, labels, planes, adopted)
     return RoofPlanes(
         np.stack([component[adopted] for component in normals.astype(np.float32)]),
         small[labels] | fork,
@@ -117,19 +119,34 @@ def _find_faces(z: Array, datum: float, sigma: float, step: float) -> tuple[NDAr
     tolerance = TOLERANCE * sigma
     labels = np.zeros(z.shape, np.int32)
     window_px = (2 * faces.SEED_RADIUS + 1) ** 2
-    count = faces.grow(z, datum, labels, faces.window_fits(z, datum), sigma, tolerance, window_px, 1)
-    free = faces.free_fits(z, datum, labels, step)
-    count = faces.grow(z, datum, labels, free, sigma, tolerance, faces.LEAST_PX, count)
-    planes = np.zeros((count, 5))
-    moments = faces.face_moments(z, datum, labels, planes, math.inf)
-    faces.merge(labels, moments, sigma)
+    face = np.zeros(10), np.zeros(5)  # scratch: moments and plane of one
+    queue = np.zeros((2 * faces.REACH_PX + 1) ** 2, np.int32)
+    tilts, rms = _no_fits(z.shape)
+    faces.window_fits(z, datum, tilts, rms, np.zeros((3, z.shape[1])))
+    seeds = faces.best_first(rms, sigma)
+    count = faces.grow(z, datum, labels, tilts, seeds, tolerance, window_px, 1, queue, *face)
+    tilts, rms = _no_fits(z.shape)
+    faces.free_fits(z, datum, labels, step, tilts, rms, *face)
+    seeds = faces.best_first(rms, sigma)
+    count = faces.grow(z, datum, labels, tilts, seeds, tolerance, faces.LEAST_PX, count, queue, *face)
+    planes, moments = np.zeros((count, 5)), np.zeros((count, 10))
+    faces.add_moments(z, datum, labels, planes, math.inf, moments)
+    faces.merge(labels, moments, sigma, np.arange(count), face[0])
     faces.fit_planes(moments, planes)
     for _ in range(SWEEPS):
-        faces.relabel(z, datum, labels, planes, sigma)
-        labels = faces.resolve(z, datum, labels, planes, sigma, tolerance)
-        moments = faces.face_moments(z, datum, labels, planes, tolerance)
+        near, votes = np.zeros((2, 8), np.int32)
+        faces.relabel(z, datum, labels, planes, sigma, faces.border(labels), near, votes)
+        settled, moments = labels.copy(), np.zeros((count, 10))
+        faces.resolve(z, datum, labels, planes, sigma, tolerance, faces.border(labels), settled)
+        labels = settled
+        faces.add_moments(z, datum, labels, planes, tolerance, moments)
         faces.fit_planes(moments, planes)
     return labels, planes, moments
+
+
+def _no_fits(shape: tuple[int, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Fits as `tscorr.terrain.faces` describes them, without any plane."""
+    return np.zeros((*shape, 3), np.float32), np.full(shape, np.inf, np.float32)
 
 
 def _face_normals(planes: Array, cell_x_m: float, cell_y_m: float) -> Array:

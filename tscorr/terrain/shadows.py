@@ -314,14 +314,18 @@ def march(
         )
     field = np.broadcast_to(field.reshape(3, *(field.shape[1:] or (1, 1))), (3, *shape))
     relief = np.ascontiguousarray(heights, np.float32)
-    visible: Mask = sightlines.march(
+    visible: Mask = np.ones(shape, np.bool_)
+    tile_peaks = sightlines.peaks(relief)
+    sightlines.march(
         relief,
-        sightlines.peaks(relief),
+        tile_peaks,
+        tile_peaks.max(),
         field,
         asked,
         first=(rows.start, cols.start),
         cell=(float(cell_x_m), float(cell_y_m)),
         tolerance=float(tolerance_m),
+        visible=visible,
     )
     return visible
 

@@ -2,7 +2,8 @@
 
 Between two samples the surface is a straight line, or, where that is steeper than `WALL_SLOPE`, a
 wall midway. Ray states are float32 heights above an origin; positions are float64 until what is left
-is a fraction of a pixel. Imports nothing of ours: numba's cache does not see edits in other files.
+is a fraction of a pixel. Nothing is allocated in the sweeps, results and scratch memory are given to them: that halves
+what there is to compile. Imports nothing of ours: numba's cache does not see edits in other files.
 """
 
 import math
@@ -16,17 +17,24 @@ SHEER_M = 1e5  # a line of sight that rises by so much in a pixel is above every
 TILE_PX = 16  # a march skips such squares where it is above their highest point
 VOID = np.float32(-1e9)  # a surface so low that it hides nothing
 
-_JIT: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+_PART: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "_nrt": False,
+    "no_cfunc_wrapper": True,
+    "no_cpython_wrapper": True,
+}
+_LOOP: dict[str, Any] = {**_PART, "no_cpython_wrapper": False, "cache": True}
 
 
-@njit(**_JIT)
+@njit(**_PART)
 def _between(a, b, fraction, wall):
     """The surface a `fraction` of the way from `a` to `b`: a straight line, or a wall midway."""
     nearest = b if fraction >= np.float32(0.5) else a
     return nearest if abs(b - a) > wall else a + fraction * (b - a)
 
 
-@njit(**_JIT)
+@njit(**_PART)
 def _load(line, heights, i, transposed, origin):
     """Line `i` of the heights above the origin, voids sunk, and the pixel at each end once more."""
     width = line.size - 2
@@ -42,7 +50,7 @@ def _load(line, heights, i, transposed, origin):
     line[0], line[width + 1] = line[1], line[width]
 
 
-@njit(**_JIT)
+@njit(**_PART)
 def _store(visible, i, transposed, seen):
     """Put what is seen of line `i` in its place."""
     if transposed:
@@ -53,9 +61,9 @@ def _store(visible, i, transposed, seen):
             visible[i, m] = seen[m]
 
 
-@njit(**_JIT)
+@njit(**_LOOP)
 def judge_parallel(
-    heights, visible, rays, transposed, backwards, first, low, ray0, slant, drop, central, depth, apex,
+    heights, visible, rays, line, seen, transposed, backwards, first, low, ray0, slant, drop, central, depth, apex,
     origin, walls, tolerance,
 ):  # fmt: skip
     """Lines of heights and what is visible of them, from line `first` and pixel `low` of the scene on.
@@ -63,14 +71,14 @@ def judge_parallel(
     Ray k crosses line j at the pixel k + slant j; `rays` (2, rays) carry, from ray -ray0 on, the height
     below which nothing is seen and the surface on the line before. To the next line the line of sight
     falls by `drop` or, if `central`, away from an apex: `depth` and `apex` are planes (value at the
-    origin, per line, per pixel) of the distance from there, in lines, and of its height.
+    origin, per line, per pixel) of the distance from there, in lines, and of its height. `line` (width + 2,)
+    and `seen` (width,) are scratch.
     """
     lines, width = heights.shape[::-1] if transposed else heights.shape
     one, half, fall = np.float32(1.0), np.float32(0.5), np.float32(drop)
     wall_along, wall_across = np.float32(walls[0]), np.float32(walls[1])
     slack, origin = np.float32(tolerance), np.float32(origin)
     depth_per_pixel, apex_per_pixel = np.float32(depth[2]), np.float32(apex[2])
-    line, seen = np.empty(width + 2, np.float32), np.ones(width, np.bool_)
     for n in range(lines):
         i = lines - 1 - n if backwards else n
         _load(line, heights, i, transposed, origin)
@@ -106,14 +114,14 @@ def judge_parallel(
         _store(visible, i, transposed, seen)
 
 
-@njit(**_JIT)
+@njit(**_LOOP)
 def judge_fan(
-    heights, visible, rays, tangents, walls, transposed, backwards, first, low, scene_width, nadir,
+    heights, visible, rays, line, seen, tangents, walls, transposed, backwards, first, low, scene_width, nadir,
     origin, wall_across, tolerance,
 ):  # fmt: skip
     """Lines of heights and what is visible of them, from line `first` and pixel `low` of the scene on.
 
-    Ray k crosses line j at the pixel nadir[1] + tangents[k] (j - nadir[0]); `rays` as in
+    Ray k crosses line j at the pixel nadir[1] + tangents[k] (j - nadir[0]); `rays`, `line` and `seen` as in
     `judge_parallel`. Judged are the pixels no further from the nadir along the line than across.
     """
     lines, width = heights.shape[::-1] if transposed else heights.shape
@@ -121,7 +129,6 @@ def judge_fan(
     first_tangent, spacing = tangents[0], tangents[1] - tangents[0]
     last_ray = tangents.size - 1
     hidden_below, behind = rays[0], rays[1]
-    line, seen = np.empty(width + 2, np.float32), np.ones(width, np.bool_)
     for n in range(lines):
         i = lines - 1 - n if backwards else n
         _load(line, heights, i, transposed, origin)
@@ -153,11 +160,10 @@ def judge_fan(
         _store(visible, i, transposed, seen)
 
 
-@njit(**_JIT)
-def peaks(heights):
-    """The highest point of each tile of `TILE_PX` and of the pixels that touch it."""
+@njit(**_LOOP)
+def set_peaks(heights, highest):
+    """Raise `highest` to the highest point of each tile of `TILE_PX` and of the pixels that touch it."""
     rows, cols = heights.shape
-    highest = np.full(((rows - 1) // TILE_PX + 1, (cols - 1) // TILE_PX + 1), VOID)
     for i in range(highest.shape[0]):
         for row in range(max(i * TILE_PX - 1, 0), min((i + 1) * TILE_PX + 1, rows)):
             for j in range(highest.shape[1]):
@@ -166,14 +172,22 @@ def peaks(heights):
                     height = heights[row, col]
                     peak = height if height > peak else peak  # noqa: FURB136 - max() and nan: who knows
                 highest[i, j] = peak
+
+
+def peaks(heights):
+    """The highest point of each tile of `TILE_PX` and of the pixels that touch it."""
+    rows, cols = heights.shape
+    highest = np.full(((rows - 1) // TILE_PX + 1, (cols - 1) // TILE_PX + 1), VOID)
+    set_peaks(heights, highest)
     return highest
 
 
-@njit(**_JIT)
-def march(heights, tile_peaks, direction, needed, first, cell, tolerance):
-    """Whether each needed pixel of a window, from the pixel `first` of the heights on, sees its source."""
-    visible = np.ones(needed.shape, np.bool_)
-    highest = tile_peaks.max()
+@njit(**_LOOP)
+def march(heights, tile_peaks, highest, direction, needed, first, cell, tolerance, visible):
+    """Set in `visible` whether each needed pixel of a window sees its source.
+
+    first : the window's first pixel, in the heights; highest : of `tile_peaks`.
+    """
     for r in range(needed.shape[0]):
         for c in range(needed.shape[1]):
             row, col = first[0] + r, first[1] + c
@@ -185,10 +199,9 @@ def march(heights, tile_peaks, direction, needed, first, cell, tolerance):
                 visible[r, c] = up > 0.0 and _is_free(
                     heights, tile_peaks, row, col, down, right, up, cell, highest, height + tolerance
                 )
-    return visible
 
 
-@njit(**_JIT)
+@njit(**_PART)
 def _is_free(heights, tile_peaks, row, col, down, right, up, cell, highest, eye):
     """Whether the ray that leaves a pixel at the height `eye` meets nothing; `down`, `right` in pixels."""
     by_rows = abs(down) >= abs(right)
@@ -220,7 +233,7 @@ def _is_free(heights, tile_peaks, row, col, down, right, up, cell, highest, eye)
     return True
 
 
-@njit(**_JIT)
+@njit(**_PART)
 def _steps_left(position, step, tile):
     """How many steps a ray can surely take within the tile."""
     if step > 0.0:
@@ -228,7 +241,7 @@ def _steps_left(position, step, tile):
     return (position - tile * TILE_PX) / -step if step < 0.0 else np.inf
 
 
-@njit(**_JIT)
+@njit(**_PART)
 def _surface(heights, row, col, down, right, by_rows, wall):
     """The surface where a ray from (row, col) crosses a line of pixels; the scene's edge goes on level.
 
@@ -248,7 +261,7 @@ def _surface(heights, row, col, down, right, by_rows, wall):
     return _between(_sunk(a), _sunk(b), across - whole, wall)
 
 
-@njit(**_JIT)
+@njit(**_PART)
 def _sunk(height):
     """The height, or a depth where it is void."""
     return np.float64(VOID if np.isnan(height) else height)

@@ -1,0 +1,82 @@
+"""The first run on a machine says that it compiles; later ones find what it compiled, wherever that may be kept."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+from numba import njit
+from small_scene import small_scene
+
+import tscorr
+from tscorr.cli import cli
+from tscorr.cli.common import COMPILING, compilation_told
+
+PACKAGE = Path(tscorr.__file__).parent
+COUNT = """
+import numpy as np
+from numba.core.event import RecordingListener, install_listener
+from tscorr.scene.compiled import count_values
+with install_listener("numba:compile", RecordingListener()) as heard:
+    count_values(np.zeros((2, 2), np.uint16), np.zeros(1 << 16, np.int64))
+print(len(heard.buffer))
+"""
+
+
+def compiled(folder, environment):
+    """How often a new process, started in a folder, begins and ends a compilation for one function."""
+    place = {"cwd": folder, "env": environment}
+    result = subprocess.run([sys.executable, "-c", COUNT], **place, capture_output=True, text=True, check=True)
+    return int(result.stdout)
+
+
+def heard(enabled):
+    """What a command that compiles two functions says on stderr."""
+
+    @click.command()
+    def command():
+        with compilation_told(enabled=enabled):
+            for one in (1, 2):
+                njit(lambda x, one=one: x + one)(1)
+
+    return CliRunner().invoke(command).stderr
+
+
+def test_compilation_is_told_once():
+    assert heard(enabled=True) == f"{COMPILING}\n"
+    assert heard(enabled=False) == ""
+
+
+def test_a_second_process_compiles_nothing(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(PACKAGE.parent)}
+    assert compiled(tmp_path, environment) > 0
+    assert compiled(tmp_path, environment) == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="XDG_CACHE_HOME is of Linux")
+def test_nor_where_the_package_cannot_be_written_to(tmp_path):
+    """Files where the folders of compiled code would stand: so it is kept in the user's cache."""
+    installed = tmp_path / "installed" / "tscorr"
+    shutil.copytree(PACKAGE, installed, ignore=shutil.ignore_patterns("__pycache__"))
+    folders = [installed, *(path for path in installed.rglob("*") if path.is_dir())]
+    for folder in folders:
+        (folder / "__pycache__").touch()
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment |= {"PYTHONPATH": str(installed.parent), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    assert compiled(tmp_path, environment) > 0
+    assert compiled(tmp_path, environment) == 0
+    assert list((tmp_path / "cache").rglob("compiled.count_values-*.nbi"))
+
+
+def test_a_second_run_compiles_nothing(tmp_path):
+    """Whatever a run needs, from the first row to the report."""
+    config = str(small_scene(tmp_path))
+    assert CliRunner().invoke(cli, ["run", config, "-q"]).exit_code == 0
+    again = [sys.executable, "-m", "tscorr", "run", config, "--overwrite"]
+    result = subprocess.run(again, capture_output=True, text=True, check=True)
+    assert result.stderr == ""
+    assert "results: " in result.stdout
