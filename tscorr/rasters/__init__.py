@@ -3,7 +3,7 @@
 GDAL never applies scale and offset; neither does anything here: blocks hold stored values.
 """
 
-from tscorr.rasters.decimated import read_decimated, read_decimated_flags
+from tscorr.rasters.decimated import LEAST_STEP, Means, decimated, read_decimated, read_decimated_flags
 from tscorr.rasters.difference import expressible, write_difference
 from tscorr.rasters.envi_writing import ENVI_SUFFIX, EnviWriter
 from tscorr.rasters.header import (
@@ -26,9 +26,11 @@ __all__ = [
     "ENVIRONMENT",
     "ENVI_SUFFIX",
     "IMAGE_TYPES",
+    "LEAST_STEP",
     "EnviWriter",
     "KeptReader",
     "Layer",
+    "Means",
     "RasterInfo",
     "Reader",
     "StoredTiles",
@@ -36,6 +38,7 @@ __all__ = [
     "can_hold",
     "check_metric",
     "check_overlap",
+    "decimated",
     "describe",
     "expressible",
     "join_rows",

@@ -1,5 +1,6 @@
 """Rasters made small, for pictures and for a first look at their values."""
 
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,7 +9,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
-from tscorr.grid import blocks
+from tscorr.grid import Block, blocks
 from tscorr.rasters.header import ENVIRONMENT, RasterInfo, opened
 from tscorr.rasters.reading import Reader
 
@@ -26,7 +27,7 @@ def read_decimated(info: RasterInfo, max_size: int, bands: Sequence[int] | None 
     Averages of the valid values; nan where there is none, or one is infinite. Overviews are used where the file has
     them; else each tile is decoded once.
     """
-    shape, step = _decimated(info, max_size)
+    shape, step = decimated(info.shape, max_size)
     indexes = list(bands or range(1, info.bands + 1))
     if info.pixel_by_pixel is None:
         with opened(info.path, ours=info.ours) as dataset:
@@ -36,43 +37,92 @@ def read_decimated(info: RasterInfo, max_size: int, bands: Sequence[int] | None 
                 filled = np.ma.filled(values.astype(np.float32), np.nan)
                 filled[~np.isfinite(filled)] = np.nan
                 return filled
-    return _means(info, shape, indexes)
+    means = Means(info.shape, shape, len(indexes))
+    with rasterio.Env(**ENVIRONMENT), Reader(info) as reader:
+        for block in blocks(info.shape, _piece(info)):
+            values = reader.read(block, indexes)
+            missing = _missing(values, info.nodata)
+            if missing is None:
+                count = means.cells.sizes(block)
+            else:
+                values[missing] = 0
+                count = means.cells.sums(block, ~missing)
+            means.add(block, means.cells.sums(block, values), count)
+    return means.values()
 
 
 def read_decimated_flags(info: RasterInfo, max_size: int) -> Array:
     """A flag layer on the pixels of `read_decimated`: (rows, cols), the nearest value."""
-    shape, _ = _decimated(info, max_size)
+    shape, _ = decimated(info.shape, max_size)
     with opened(info.path, ours=info.ours) as dataset:
         return dataset.read(1, out_shape=shape)
 
 
-def _decimated(info: RasterInfo, max_size: int) -> tuple[tuple[int, int], float]:
-    """Shape of a raster that was made small, and the pixels that become one."""
-    rows, cols = info.shape
-    step = max(1.0, max(rows, cols) / max_size)
-    return (max(1, round(rows / step)), max(1, round(cols / step))), step
+def decimated(shape: tuple[int, int], max_size: int) -> tuple[tuple[int, int], float]:
+    """Shape of a raster that was made small, and how many pixels become one, along a side."""
+    step = max(1.0, max(shape) / max_size)
+    return (max(1, round(shape[0] / step)), max(1, round(shape[1] / step))), step
 
 
-def _means(info: RasterInfo, shape: tuple[int, int], indexes: Sequence[int]) -> Array:
-    """Means of the valid values of the cells of a coarse grid, float32 (bands, *shape); read piece by piece."""
-    total, count = np.zeros((2, len(indexes), *shape))
-    edges = [np.arange(coarse) * fine // coarse for coarse, fine in zip(shape, info.shape, strict=True)]
-    with rasterio.Env(**ENVIRONMENT), Reader(info) as reader:
-        for block in blocks(info.shape, _piece(info)):
-            values = reader.read(block, indexes)
-            (i, rows), (j, cols) = (
-                _cells(edge, first, length)
-                for edge, first, length in zip(edges, (block.row, block.col), block.shape, strict=True)
-            )
-            missing = _missing(values, info.nodata)
-            if missing is not None:
-                values[missing] = 0
-                count[:, i, j] -= _sums(missing, rows, cols)
-            total[:, i, j] += _sums(values, rows, cols)
-            count[:, i, j] += np.outer(np.diff(rows, append=block.height), np.diff(cols, append=block.width))
-    means = (total / np.where(count > 0, count, np.nan)).astype(np.float32)
-    means[~np.isfinite(means)] = np.nan
-    return means
+class Cells:
+    """The cells of a coarse grid over a raster: rectangles of whole pixels.
+
+    fine, coarse : (rows, cols) of the raster and of the grid.
+    """
+
+    def __init__(self, fine: tuple[int, int], coarse: tuple[int, int]) -> None:
+        self._edges = [np.arange(n) * length // n for n, length in zip(coarse, fine, strict=True)]
+
+    def under(self, block: Block) -> tuple[slice, slice]:
+        """Rows and columns of the cells that a block has pixels of."""
+        return self._run(0, block.row, block.height), self._run(1, block.col, block.width)
+
+    def sums(self, block: Block, values: Array) -> Array:
+        """Sums (layers, rows, cols) over the pixels that each cell has in a block, of values (layers, rows, cols)."""
+        rows, cols = self._starts(block)
+        by_row = np.empty((len(values), len(rows), block.width))
+        for i, (top, bottom) in enumerate(zip(rows, [*rows[1:], block.height], strict=True)):
+            np.add.reduce(values[:, top:bottom], axis=1, dtype=float, out=by_row[:, i])
+        return np.add.reduceat(by_row, cols, axis=2)
+
+    def sizes(self, block: Block) -> Array:
+        """How many pixels each cell has in a block: (1, rows, cols)."""
+        rows, cols = self._starts(block)
+        return np.outer(np.diff(rows, append=block.height), np.diff(cols, append=block.width))[None]
+
+    def _starts(self, block: Block) -> tuple[Array, Array]:
+        """The first row and column in a block of each cell."""
+        down, right = self.under(block)
+        return np.maximum(self._edges[0][down] - block.row, 0), np.maximum(self._edges[1][right] - block.col, 0)
+
+    def _run(self, axis: int, first: int, length: int) -> slice:
+        start, last = np.searchsorted(self._edges[axis], (first, first + length - 1), "right") - 1
+        return slice(int(start), int(last) + 1)
+
+
+class Means:
+    """Means over coarse cells, from blocks in any order and of any thread.
+
+    fine, coarse : of the cells. layers : how many are averaged.
+    """
+
+    def __init__(self, fine: tuple[int, int], coarse: tuple[int, int], layers: int) -> None:
+        self.cells = Cells(fine, coarse)
+        self._total, self._count = np.zeros((2, layers, *coarse))
+        self._lock = threading.Lock()
+
+    def add(self, block: Block, sums: Array, counts: Array) -> None:
+        """Add the sums (layers, rows, cols) of a block's cells, and of how many values they are."""
+        under = self.cells.under(block)
+        with self._lock:
+            self._total[:, *under] += sums
+            self._count[:, *under] += counts
+
+    def values(self) -> Array:
+        """The means, float32 (layers, rows, cols); nan where there is nothing, or not a number."""
+        means = (self._total / np.where(self._count > 0, self._count, np.nan)).astype(np.float32)
+        means[~np.isfinite(means)] = np.nan
+        return means
 
 
 def _piece(info: RasterInfo) -> tuple[int, int]:
@@ -83,14 +133,6 @@ def _piece(info: RasterInfo) -> tuple[int, int]:
     return max(1, int(room / tile_rows)) * tile_rows, width
 
 
-def _cells(edges: Array, first: int, length: int) -> tuple[slice, Array]:
-    """The cells that a run of pixels lies in, and where in the run each of them starts."""
-    cell = slice(
-        int(np.searchsorted(edges, first, "right")) - 1, int(np.searchsorted(edges, first + length - 1, "right"))
-    )
-    return cell, np.maximum(edges[cell] - first, 0)
-
-
 def _missing(values: Array, nodata: float | None) -> Array | None:
     """Where there are no data; None where nobody can say. An infinite value becomes nan, which no sum hides."""
     if values.dtype.kind == "f":
@@ -98,11 +140,3 @@ def _missing(values: Array, nodata: float | None) -> Array | None:
     if nodata is None:
         return None
     return np.isnan(values) if np.isnan(nodata) else values == nodata
-
-
-def _sums(values: Array, rows: Array, cols: Array) -> Array:
-    """Sums (bands, rows, cols) of the cells that start at these rows and columns of some values."""
-    by_row = np.empty((len(values), len(rows), values.shape[2]))
-    for i, (top, bottom) in enumerate(zip(rows, [*rows[1:], values.shape[1]], strict=True)):
-        np.add.reduce(values[:, top:bottom], axis=1, dtype=float, out=by_row[:, i])
-    return np.add.reduceat(by_row, cols, axis=2)

@@ -19,7 +19,7 @@ from tscorr.angles import relative_azimuth, true_azimuth, zenith_azimuth
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid, longitude_latitude
 from tscorr.report import SceneFacts, page, summary, write_json
-from tscorr.scene.pictures import PICTURE_PX, draw_quicklook
+from tscorr.scene.pictures import PICTURE_PX, Lights, draw_quicklook
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import written_products
 from tscorr.scene.run import Pipeline, Progress, Sums, silent
@@ -94,15 +94,20 @@ def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
     ):
         pipeline = Pipeline(scene, publication.folder)
         pipeline.run(progress)
-        return finish(scene, publication, hashes, pipeline.sums, time.perf_counter() - started)
+        return finish(scene, publication, hashes, pipeline.sums, time.perf_counter() - started, pipeline.lights)
 
 
 def finish(
-    scene: Scene, publication: publish.Publication, hashes: publish.EarlyHashes, sums: Sums, wall_s: float
+    scene: Scene,
+    publication: publish.Publication,
+    hashes: publish.EarlyHashes,
+    sums: Sums,
+    wall_s: float,
+    lights: Lights | None = None,
 ) -> dict[str, Any]:
     """Write what stands beside the rasters of a scene, and publish; the content of its report.json.
 
-    hashes : of the scene's inputs.
+    hashes : of the scene's inputs. lights : of before and after, if they were gathered.
     """
     folder = publication.folder
     publication.hash_early(sorted(folder.iterdir()))
@@ -119,7 +124,7 @@ def finish(
         report["bad_bands"] = scene.bad_names
     if (covered := coverage(scene, folder)) is not None:
         report["coverage"] = covered
-    picture = draw_quicklook(scene, folder, results) if scene.config.output.quicklook else None
+    picture = draw_quicklook(scene, folder, results, lights) if scene.config.output.quicklook else None
     write_json(report, folder / "report.json")
     widths = _decimated_widths(results)
     (folder / "report.html").write_text(page(report, facts, picture, widths), encoding="utf-8")

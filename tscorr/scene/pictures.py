@@ -3,13 +3,14 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tscorr import quicklook, rasters
 from tscorr.errors import InputError
+from tscorr.grid import Block
 
 if TYPE_CHECKING:
     from tscorr.scene.plan import Scene
@@ -24,20 +25,70 @@ BANDS_AT_ONCE = 8
 """bands of one file are read together: where they are stored together, each piece is then decoded once"""
 
 
-def draw_quicklook(scene: "Scene", folder: Path, results: Mapping[str, rasters.RasterInfo]) -> Path:
-    """The picture of before, after and flags, of a scene that is being published; `results` by product."""
-    image = scene.image
-    wavelengths = _good(scene.wavelengths_um, image)
-    matrix = quicklook.rgb_matrix(wavelengths, image.fwhm_um)
-    used = quicklook.used_bands(matrix)
-    result = results.get("corrected", image)
-    scale, offset = scene.stored.scale, scene.stored.offset
+class Lights:
+    """Before and after of a scene in linear light, gathered from its blocks: no file need be decoded for them again.
 
-    def light(info: rasters.RasterInfo) -> Array:
-        return quicklook.linear_rgb(_reflectance(info, used, scale, offset, PICTURE_PX), matrix[used])
+    Of a large image every so many rows count. Any thread may ask and add.
+    """
 
-    with ThreadPoolExecutor(2) as readers:  # to decode them is most of the work
-        before, after = readers.map(light, (image, result))
+    def __init__(self, scene: "Scene") -> None:
+        self._stored = scene.stored
+        shape, step = rasters.decimated(scene.image.shape, PICTURE_PX)
+        self._stride = max(1, int(step) // rasters.LEAST_STEP)
+        _, matrix = _colours(scene)
+        self._used = quicklook.used_bands(matrix)
+        weights = matrix[self._used].T
+        self._weights = weights * np.array(scene.stored.scale)[self._used]
+        self._dark = weights @ np.array(scene.stored.offset)[self._used]
+        thinned = -(-scene.image.shape[0] // self._stride), scene.image.shape[1]
+        self._before, self._after = (rasters.Means(thinned, shape, 3) for _ in range(2))
+
+    @classmethod
+    def of(cls, scene: "Scene") -> Self | None:
+        """None where no picture is asked for, or the files are so small that they can be read again."""
+        _, step = rasters.decimated(scene.image.shape, PICTURE_PX)
+        return cls(scene) if scene.config.output.quicklook and step >= rasters.LEAST_STEP else None
+
+    def of_block(self, block: Block, image: Array) -> tuple[Array, Array]:
+        """Light of a block (bands, rows, cols) of stored values: its sums over cells, and of how many pixels."""
+        thin, cells = self._thinned(block), self._before.cells
+        rows = slice(-block.row % self._stride, None, self._stride)
+        values = np.stack([image[band, rows] for band in self._used])
+        missing = ~np.isfinite(values).all(axis=0)
+        if self._stored.has_nodata:
+            missing |= (values == self._stored.nodata).any(axis=0)
+        if missing.any():
+            values[:, missing] = 0
+            counts = cells.sums(thin, ~missing[None])
+        else:
+            counts = cells.sizes(thin)
+        return np.tensordot(self._weights, cells.sums(thin, values), 1) + self._dark[:, None, None] * counts, counts
+
+    def add(self, block: Block, before: tuple[Array, Array], after: tuple[Array, Array]) -> None:
+        """Add a block, as `of_block` saw it before and after the correction."""
+        thin = self._thinned(block)
+        self._before.add(thin, *before)
+        self._after.add(thin, *after)
+
+    def images(self) -> tuple[Array, Array]:
+        """Before and after: linear sRGB (rows, cols, 3), nan without data."""
+        return np.moveaxis(self._before.values(), 0, 2), np.moveaxis(self._after.values(), 0, 2)
+
+    def _thinned(self, block: Block) -> Block:
+        """A block among the rows that count."""
+        first, end = (-(-row // self._stride) for row in (block.row, block.row + block.height))
+        return Block(first, block.col, end - first, block.width)
+
+
+def draw_quicklook(
+    scene: "Scene", folder: Path, results: Mapping[str, rasters.RasterInfo], lights: Lights | None = None
+) -> Path:
+    """The picture of before, after and flags, of a scene that is being published.
+
+    results : by product. lights : before and after, if they were gathered.
+    """
+    wavelengths, matrix = _colours(scene)
+    before, after = _read_lights(scene, matrix, results) if lights is None else lights.images()
     path = folder / "quicklook.png"
     flag_file = results.get("flags")
     flags = np.zeros(before.shape[:2], np.uint16)
@@ -46,6 +97,25 @@ def draw_quicklook(scene: "Scene", folder: Path, results: Mapping[str, rasters.R
     note = quicklook.rendering_note(wavelengths, matrix)
     quicklook.before_after(before, after, flags, path, title=scene.name, note=note)
     return path
+
+
+def _colours(scene: "Scene") -> tuple[tuple[float, ...], Array]:
+    """Wavelengths of the bands that can be shown, and what each adds to red, green and blue."""
+    wavelengths = _good(scene.wavelengths_um, scene.image)
+    return wavelengths, quicklook.rgb_matrix(wavelengths, scene.image.fwhm_um)
+
+
+def _read_lights(scene: "Scene", matrix: Array, results: Mapping[str, rasters.RasterInfo]) -> tuple[Array, Array]:
+    """Before and after, from the files."""
+    used = quicklook.used_bands(matrix)
+    scale, offset = scene.stored.scale, scene.stored.offset
+
+    def light(info: rasters.RasterInfo) -> Array:
+        return quicklook.linear_rgb(_reflectance(info, used, scale, offset, PICTURE_PX), matrix[used])
+
+    with ThreadPoolExecutor(2) as readers:  # to decode them is most of the work
+        before, after = readers.map(light, (scene.image, results.get("corrected", scene.image)))
+    return before, after
 
 
 def draw_image(

@@ -31,6 +31,7 @@ from tscorr.correction.sigmas import SigmaTally
 from tscorr.grid import Block, blocks, north_of
 from tscorr.scene.bad_bands import BadBands
 from tscorr.scene.ground import Ground
+from tscorr.scene.pictures import Lights
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import ANGLE_NAMES, write_corrected_vrt, writer_of, written_products
 from tscorr.scene.skipping import SHADOW_OR_NODATA, Idle, Skipping, tallied
@@ -168,6 +169,8 @@ class Pipeline:
         self.bad_bands = BadBands(scene.image.bad_bands)
         self._by_brightness = ShadowByBrightness.of(scene.materials, scene.stored, scene.wavelengths_um)
         self.sums = Sums(len(scene.materials), scene.image.bands)
+        self.lights = Lights.of(scene) if strip is None else None
+        """before and after, gathered for the picture"""
         self._skipping = Skipping(scene, self.corrector.peaks)
         self._north = north_of(scene.grid)
         self._tables = [
@@ -238,7 +241,7 @@ class Pipeline:
         with self.sums.timed("read"):
             rows = class_rows(self.classes.read(block, 1), self.scene.rows)
             stored = self._stored if self._stored is not None and self._stored.holds(block) else None
-            unread = (self._as_difference or stored is not None) and not self._skipping.flags_need_image
+            unread = (self._as_difference or stored is not None) and not self._image_is_needed
             image, bad = (None, None) if unread else self._read_image(block)
         needed = self.corrector.peaks.take(rows)  # in half the time of peaks[rows]
         with self.sums.timed("geometry"):
@@ -250,11 +253,15 @@ class Pipeline:
                 image, bad = self._read_image(block)
         elif image is None:
             image = np.empty((0, *block.shape), self.scene.image.dtype)
+        before = self.lights.of_block(block, image) if self.lights is not None else None
         if idle is None:
             result, layers = self._corrected(block, image, rows, needed, shade)
         else:
             result = self._passed_through(block, image, rows, idle)
             layers = self._idle_layers(block)
+        if self.lights is not None and before is not None:
+            after = before if dark or idle is not None else self.lights.of_block(block, result.corrected)
+            self.lights.add(block, before, after)
         if bad is not None:
             self.bad_bands.put_back(result.corrected, bad)
         layers |= {"flags": result.flags[None]}
@@ -270,6 +277,11 @@ class Pipeline:
             self._write(block, layers, stored)
         self.sums.add(result, rows, SHADOW_OR_NODATA if dark else None if idle is None else idle.reason)
         return rows.size
+
+    @property
+    def _image_is_needed(self) -> bool:
+        """Whether flags or the picture depend on the image, even where nothing is to be removed from it."""
+        return self._skipping.flags_need_image or self.lights is not None
 
     def _write(self, block: Block, layers: dict[str, Array], stored: rasters.StoredTiles | None) -> None:
         """Write the layers of a block; `stored` holds the corrected image where nothing changed."""
