@@ -91,6 +91,8 @@ LIT, SHADED = 1, 2
 BLOCK: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
 STEP: dict[str, Any] = {**BLOCK, "no_cpython_wrapper": True}
 """how `correct_block` and its steps are compiled: without reference counts, since nothing is allocated"""
+BAND: dict[str, Any] = {**STEP, "forceinline": True}
+"""and the steps of each band: a fifth of the time of a band went into calling them"""
 
 
 class MaterialTable(NamedTuple):
@@ -359,7 +361,7 @@ def correct_block(
             # Which materials there are, and whether the geometry lets them be assessed.
             _load(material[row, start:stop], marks, whole)
             for b in range(bands):
-                _look(image[b, row, start:stop], rules.saturation[b], rules.has_nodata, nodata, whole)
+                _look(image[b, row, start:stop], rules, b, nodata, whole)
             kinds, peaks = _list_kinds(whole, count, table.peak, present)
             for place in range(peaks):
                 _set_rules(whole, real, table, present[place])
@@ -432,14 +434,18 @@ def _load(kinds, marks, whole):
         whole[MARKS + j] = marks[j]
 
 
-@njit(**STEP)
-def _look(line, saturation, has_nodata, nodata, whole):
-    """Which pixels have no data in a band, and which are saturated in it."""
-    for j in range(line.size):
-        value = np.float32(line[j])
-        whole[MISSING + j] |= np.int32(value - value != ZERO)
-        whole[SATURATES + j] |= np.int32(value >= saturation)
-    if has_nodata:
+@njit(**BAND)
+def _look(line, rules, b, nodata, whole):
+    """Which pixels have no data in a band, and which are saturated in it; integers always have a value."""
+    saturation = rules.saturation[b]
+    if rules.integer is None:
+        for j in range(line.size):
+            value = np.float32(line[j])
+            whole[MISSING + j] |= np.int32(value - value != ZERO)
+    if saturation < ENDLESS:
+        for j in range(line.size):
+            whole[SATURATES + j] |= np.int32(np.float32(line[j]) >= saturation)
+    if rules.has_nodata:
         for j in range(line.size):
             whole[MISSING + j] |= np.int32(line[j] == nodata)
 
@@ -629,7 +635,8 @@ def _set_amounts(scratch, table, peaks, skip, equations, extras):
                 _set_lobe_by_equations(whole, real, aims, table.w[:, b], table.n[:, b], table.k[:, b])
                 if weighted:
                     _scale(real, LOBE, WEIGHT)
-        for place in range(peaks):
+        _set_amounts_of_all(real, amounts[b], table.gain[present[0], b])
+        for place in range(1, peaks):
             q = present[place]
             _set_amount(whole, real, amounts[b], np.int32(q), table.gain[q, b])
     return True
@@ -704,7 +711,14 @@ def _set_lobe(whole, real, kind, c, n, k):
             real[LOBE + j] = f * real[EXPONENTIAL + j] if whole[KIND + j] == kind else real[LOBE + j]
 
 
-@njit(**STEP)
+@njit(**BAND)
+def _set_amounts_of_all(real, amounts, gain):
+    """Amounts in one band as if all pixels were of one material; those that are not assessed are not looked at."""
+    for j in range(CHUNK):
+        amounts[j] = gain * real[LOBE + j]
+
+
+@njit(**BAND)
 def _set_amount(whole, real, amounts, kind, gain):
     """Amount of the pixels of one material in one band."""
     for j in range(CHUNK):
@@ -721,7 +735,7 @@ def _clear(whole, real):
         whole[OVER + j] = 0
 
 
-@njit(**STEP)
+@njit(**BAND)
 def _weigh(amounts, line, scale, offset, whole, real):
     """One band's amounts against threshold and signal; amounts below the threshold become 0."""
     for j in range(line.size):
@@ -759,7 +773,7 @@ def _settle(whole):
     return hits, blanks
 
 
-@njit(**STEP)
+@njit(**BAND)
 def _subtract(amounts, line, rules, b, whole, real):
     """One band less its amounts, in whole steps and held above 0; `amounts` become what was taken.
 
@@ -792,7 +806,7 @@ def _subtract(amounts, line, rules, b, whole, real):
         line[j] = new if take else value
 
 
-@njit(**STEP)
+@njit(**BAND)
 def _keep(amounts, taken, whole):
     """Write down what was taken from one band."""
     for j in range(taken.size):
