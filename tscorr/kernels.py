@@ -342,7 +342,7 @@ def correct_block(
                they hold; on exit all bits of PixelFlag. Those of the geometry are cleared where no material has a
                peak and where there are no data, since there nobody looks.
     material : uint8 (rows, cols), rows of `table`; 0 is no material.
-    sun, view, normal : unit vectors, float64 (3, rows, cols), or (3, 1, 1) where constant.
+    sun, view, normal : unit vectors, float64 (3, rows, cols), or (3, 1, 1) where constant; `normal` also float32.
     equations : True: the equations themselves at each pixel, in float64; or None: polynomials stand in for them, and
                the equations are not even compiled.
     options  : int64 (3,): skip, first row of the block in the image, tally every so many rows.

@@ -131,6 +131,10 @@ class Corrector:
         peak = table.peak if extras is None else table.peak | extras.has_sky
         return _Engine(precision, table._replace(peak=peak & mine), mine, extras)
 
+    def have_peaks(self, rows: Array) -> Array:
+        """Which pixels have a lobe: bool, of the corrector's row of each, uint8 (rows, cols)."""
+        return looked_up(rows, self.peaks.tobytes().ljust(256, b"\0")).view(np.bool_)
+
     @property
     def peaks(self) -> Array:
         """Which rows have a lobe to remove: bool (materials + 1,); row 0, no material, has none."""
@@ -198,7 +202,7 @@ class Corrector:
             np.ascontiguousarray(inputs.material),
             np.ascontiguousarray(inputs.sun, np.float64),
             np.ascontiguousarray(inputs.view, np.float64),
-            np.ascontiguousarray(inputs.normal, np.float64),
+            _vectors(inputs.normal, engine.precision),
             engine.table,
             self._pixels[np.dtype(real)],
             results.tally,
@@ -234,14 +238,24 @@ def _of_block(extras: kernels.Extras, inputs: BlockInputs, sigma: Array) -> kern
     return extras._replace(**fields)
 
 
+def _vectors(values: Array, precision: str) -> Array:
+    """Contiguous vectors; those in float32 are widened where they are read, by compiled code alone."""
+    as_they_are = values.dtype == np.float32 and precision != "reference"
+    return np.ascontiguousarray(values, None if as_they_are else np.float64)
+
+
+def looked_up(values: Array, table: bytes) -> Array:
+    """The entry of a table of 256 for each value, uint8; in half the time of indexing."""
+    found = np.frombuffer(values.tobytes().translate(table), np.uint8)
+    return found.reshape(values.shape).copy()
+
+
 def class_rows(classes: Array, rows: Mapping[int, int]) -> Array:
     """The corrector's row of each pixel of a class map: uint8, 0 where the class has no material."""
     if classes.dtype.kind not in "iu":
         raise InputError(f"a class map holds {classes.dtype} values; allowed are integers")
     if classes.dtype == np.uint8:
-        table = bytes(rows.get(value, 0) for value in range(256))
-        found = np.frombuffer(classes.tobytes().translate(table), np.uint8)  # in half the time of indexing
-        return found.reshape(classes.shape).copy()
+        return looked_up(classes, bytes(rows.get(value, 0) for value in range(256)))
     result = np.zeros(classes.shape, np.uint8)
     for value, row in rows.items():
         result[classes == value] = row

@@ -126,7 +126,8 @@ def _incomplete(normals: NDArray[np.float32], radius: int) -> NDArray[np.intp]:
     missing = np.ones(normals.shape[1:], np.bool_)
     inner = (slice(radius, -radius), slice(radius, -radius))
     missing[inner] = np.isnan(normals[2][inner])
-    return np.stack(np.nonzero(missing))
+    row_and_col: NDArray[np.intp] = np.stack(np.divmod(np.flatnonzero(missing), missing.shape[1]))  # faster than nonzero
+    return row_and_col
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -48,7 +48,7 @@ class FlatSurface:
     def normals(self, block: Block) -> tuple[Array, None]:
         """Up."""
         del block
-        return np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1), None
+        return np.array([0, 0, 1], np.float32).reshape(3, 1, 1), None
 
     def normal_sigma_deg(self, block: Block) -> Array:
         """Not known. [deg]"""
