@@ -123,11 +123,11 @@ def _set_normal(normals, i, j, east, north):
 
 def _incomplete(normals: NDArray[np.float32], radius: int) -> NDArray[np.intp]:
     """Rows and columns (2, pixels) of the pixels whose window is not whole: at the border and at voids."""
-    missing = np.ones(normals.shape[1:], np.bool_)
+    _, rows, cols = normals.shape
+    missing = np.ones((rows, cols), np.bool_)
     inner = (slice(radius, -radius), slice(radius, -radius))
     missing[inner] = np.isnan(normals[2][inner])
-    row_and_col: NDArray[np.intp] = np.stack(np.divmod(np.flatnonzero(missing), missing.shape[1]))  # faster than nonzero
-    return row_and_col
+    return np.stack(np.divmod(np.flatnonzero(missing), cols))  # faster than nonzero
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
