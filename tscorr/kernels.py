@@ -991,7 +991,7 @@ def _exchange(amounts, line, rules, b, highest, whole, real):
         line[j] = new if take else value
 
 
-@njit(**STEP)
+@njit(**BAND)
 def _set_noise(sigma, line, scale, offset, noise, whole):
     """1 sigma of the image in one band; nan where it has no data."""
     a, b, nothing = np.float32(noise[0]), np.float32(noise[1]), np.float32(np.nan)
@@ -1161,7 +1161,7 @@ def _add_view_turns(whole, real, view_variance):
         real[TURNS + j] += v2 * by_r * by_r * (ONE - cos_r * cos_r)
 
 
-@njit(**STEP)
+@njit(**BAND)
 def _set_spread(whole, real, kind, w2, c):
     """Relative variance of the lobe of one material in one band: from its parameters, and with the directions."""
     c5, c4, c3, c2, c1, c0 = c[5], c[4], c[3], c[2], c[1], c[0]
@@ -1192,7 +1192,7 @@ def _set_cross(whole, real, kind, c, variance):
         real[BACK_VARIANCE + j] = c[7] if mine else real[BACK_VARIANCE + j]
 
 
-@njit(**STEP)
+@njit(**BAND)
 def _spread(sigma, amounts, line, scale, offset, noise, saturation, whole, real):
     """1 sigma of one corrected band, and where that of what is removed exceeds half of what is left: subtraction."""
     base, share = real.dtype.type(noise[0]), real.dtype.type(noise[1])
