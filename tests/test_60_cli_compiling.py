@@ -15,6 +15,8 @@ from small_scene import small_scene
 import tscorr
 from tscorr.cli import cli
 from tscorr.cli.common import COMPILING, compilation_told
+from tscorr.kernels import correct_block
+from tscorr.kernels.stamp import SOURCES, sources_of
 
 PACKAGE = Path(tscorr.__file__).parent
 COUNT = """
@@ -80,3 +82,49 @@ def test_a_second_run_compiles_nothing(tmp_path):
     result = subprocess.run(again, capture_output=True, text=True, check=True)
     assert result.stderr == ""
     assert "results: " in result.stdout
+
+
+ENTRY = """
+from pathlib import Path
+from numba import njit
+from part import part
+from tscorr.kernels.stamp import sources_of
+
+@njit(cache=True)
+def entry(x, sources=sources_of(Path(__file__).parent)):
+    return part(x)
+
+print(entry(1), sum(entry.stats.cache_hits.values()))
+"""
+PART = """
+from numba import njit
+
+@njit
+def part(x):
+    return x + {step}
+"""
+
+
+def test_an_edit_of_a_part_is_compiled(tmp_path):
+    """numba's cache looks at the file of the cached function alone; the stamp of its folder tells the rest."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(PACKAGE.parent)}
+
+    def printed(step):
+        (tmp_path / "part.py").write_text(PART.format(step=step))
+        command = [sys.executable, "-B", "-c", "import entry"]
+        place = {"cwd": tmp_path, "env": environment}
+        return subprocess.run(command, **place, capture_output=True, text=True, check=True).stdout
+
+    (tmp_path / "entry.py").write_text(ENTRY)
+    assert [printed(step) for step in (1, 1, 2)] == ["2 0\n", "2 1\n", "3 0\n"]
+
+
+def test_every_file_of_the_kernel_is_in_its_stamp(tmp_path):
+    folder = shutil.copytree(PACKAGE / "kernels", tmp_path / "kernels")
+    stamps = [sources_of(folder)]
+    assert stamps == [SOURCES]
+    assert SOURCES in correct_block.py_func.__defaults__
+    for path in sorted(folder.glob("*.py")):
+        path.write_text(path.read_text() + "\n")
+        stamps.append(sources_of(folder))
+    assert len(set(stamps)) == len(stamps) > 10

@@ -69,7 +69,7 @@ def correct_block(
 
     Arguments as in kernels.correct_block. `skip` of the options means nothing here.
     """
-    from tscorr import kernels as bits  # flag values; numba is not imported before it is needed
+    from tscorr.kernels import layout as bits  # flag values; numba is not imported before it is needed
 
     stored = image.astype(np.float64)
     missing = ~np.isfinite(stored).all(axis=0)

@@ -1,6 +1,6 @@
 """The equations of Meister et al. (2000), one function an equation, in plain numpy.
 
-This is the text to read beside the paper; `kernels.py` holds the fast twins. Any float type goes in and
+This is the text to read beside the paper; `kernels` holds the fast twins. Any float type goes in and
 comes out (float32, float64, longdouble), shapes broadcast, nan gives nan.
 
 Conventions. theta_i and theta_r are measured from the surface normal. phi is the difference of the
