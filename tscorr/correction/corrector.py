@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tscorr import kernels, reference
+from tscorr import kernels
+from tscorr.correction import oracle
 from tscorr.correction.extras import extras_table, is_extra, signed
 from tscorr.correction.flags import PixelFlag
 from tscorr.correction.rules import Stored
@@ -210,7 +211,7 @@ class Corrector:
         options = np.array([self.skip, first_row, self.tally_stride], dtype=np.int64)
         extras = None if engine.extras is None else _of_block(engine.extras, inputs, results.sigma)
         if engine.precision == "reference":
-            reference.correct_block(*block, options, extras)
+            oracle.correct_block(*block, options, extras)
         else:
             scratch = kernels.new_scratch(len(inputs.image), real)
             equations = True if engine.precision == "exact" else None

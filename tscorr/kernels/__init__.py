@@ -1,4 +1,4 @@
-"""The fast arithmetic: twins of `reference.py`, and the one loop that a run spends its time in.
+"""The fast arithmetic: twins of `reference.py` and `correction/oracle.py`, the one loop that a run spends its time in.
 
 The equations take scalars and unit vectors as tuples of three, and are float64 where their arguments are.
 `correct_block` works on chunks of a row, all materials at once, in place, as a list of steps: each a small

@@ -18,7 +18,7 @@ def correct_block(
     image, removed, flags, material, sun, view, normal, table, rules, tally, scratch, equations, options, extras=None,
     sources=SOURCES,  # noqa: ARG001 - so that numba compiles again when a step is edited
 ):  # fmt: skip
-    """Take the specular part out of a block of an image, in place. Twin of reference.correct_block.
+    """Take the specular part out of a block of an image, in place. Twin of correction.oracle.correct_block.
 
     image    : (bands, rows, cols), stored values; changed in place.
     removed  : the same shape and type, zeros on entry: what was taken away. Or of no rows: not wanted.

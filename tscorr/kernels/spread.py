@@ -199,7 +199,7 @@ def _spread(sigma, amounts, line, scale, offset, noise, saturation, whole, real)
 
 @njit(**STEP)
 def _spread_parts(sigma, amounts, direct, line, scale, offset, saturation, whole, real):
-    """`_spread` for any method and with the sky's part: twin of the sigma in reference.correct_block."""
+    """`_spread` for any method and with the sky's part: twin of the sigma in correction.oracle."""
     for j in range(line.size):
         a, value, noise, sun = amounts[j], real.dtype.type(line[j]), real.dtype.type(sigma[j]), direct[j]
         r = value * scale + offset

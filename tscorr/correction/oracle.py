@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tscorr.reference.equations import (
+from tscorr.kernels import layout as bits
+from tscorr.reference import (
     Geometry,
     attenuation,
     broadened,
@@ -69,8 +70,6 @@ def correct_block(
 
     Arguments as in kernels.correct_block. `skip` of the options means nothing here.
     """
-    from tscorr.kernels import layout as bits  # flag values; numba is not imported before it is needed
-
     stored = image.astype(np.float64)
     missing = ~np.isfinite(stored).all(axis=0)
     if rules.has_nodata:
@@ -97,15 +96,15 @@ def correct_block(
         angles = geometry(*vectors)
         f = flags[where]
         has_sky = extras is not None and bool(extras.has_sky[q])
-        lit, shaded = _assessable(angles, f, table, q, bits, has_sky)
+        lit, shaded = _assessable(angles, f, table, q, has_sky)
         pixels = _Pixels(q, angles, vectors[0][2], vectors[2][2], lit, shaded, where)
-        light = _light(pixels, table, extras, bits)
+        light = _light(pixels, table, extras)
 
         values, saturated = stored[all_bands], full[all_bands]
         reflectance = values * rules.scale[:, None] + rules.offset[:, None]
         weight = _at(None if extras is None else extras.weight, where, 1.0)
-        amount, above = _amount(reflectance, light, weight, q, table, extras, bits)
-        share = _share(weight * light.specular if _adds(extras, q, bits) else amount, above, reflectance)
+        amount, above = _amount(reflectance, light, weight, q, table, extras)
+        share = _share(weight * light.specular if _adds(extras, q) else amount, above, reflectance)
         hit = above.any(axis=0)
         over = hit & (saturated.any(axis=0) | (share > table.share[q]))
         f[hit & ~over] |= bits.CORRECTED
@@ -113,7 +112,7 @@ def correct_block(
 
         take = (amount != 0) & ~saturated & (~over | (not table.ways[q] & (bits.KEEP | bits.BLANK)))
         if extras is not None and extras.sigma.shape[1]:
-            of_removed, noise_left = _sigma_removed(reflectance, light, weight, pixels, table, extras, bits)
+            of_removed, noise_left = _sigma_removed(reflectance, light, weight, pixels, table, extras)
             _spread(extras.sigma, all_bands, take, of_removed, noise_left)
             f[(take & (of_removed > np.maximum(reflectance - amount, 0) / 2)).any(axis=0)] |= bits.UNCERTAIN
         new, clipped = _subtract(values, amount, rules, None if extras is None else extras.highest[0])
@@ -136,7 +135,7 @@ def correct_block(
         _tally(tally, pixels, np.asarray(hit), tallied, share, taken, bool(table.ways[q] & bits.SIMPLIFIED))
 
 
-def _assessable(angles: Geometry, flags: Array, table: Any, q: int, bits: Any, has_sky: bool) -> tuple[Array, Array]:
+def _assessable(angles: Geometry, flags: Array, table: Any, q: int, has_sky: bool) -> tuple[Array, Array]:
     """Which pixels are assessed in the sun, and which for the sky alone; the reasons why not are set in `flags`."""
     self_shadow, behind = ~(angles.cos_i > 0), ~(angles.cos_r > 0)
     least, most = np.minimum(angles.cos_i, angles.cos_r), np.maximum(angles.cos_i, angles.cos_r)
@@ -152,7 +151,7 @@ def _assessable(angles: Geometry, flags: Array, table: Any, q: int, bits: Any, h
     return ~blocked, shaded
 
 
-def _light(pixels: _Pixels, table: Any, extras: Any, bits: Any) -> _Light:
+def _light(pixels: _Pixels, table: Any, extras: Any) -> _Light:
     """What the model says of the assessed pixels; 0 elsewhere."""
     q, angles = pixels.row, pixels.angles
     w, n, k = (getattr(table, name)[q, :, None] for name in ("w", "n", "k"))
@@ -198,16 +197,14 @@ def _at(field: Array | None, where: tuple[Array, ...], default: float) -> Array:
     return field[where].astype(float)
 
 
-def _adds(extras: Any, q: int, bits: Any) -> bool:
+def _adds(extras: Any, q: int) -> bool:
     return extras is not None and bool(extras.method[q] == bits.REFERENCE)
 
 
-def _amount(
-    reflectance: Array, light: _Light, weight: Array, q: int, table: Any, extras: Any, bits: Any
-) -> tuple[Array, Array]:
+def _amount(reflectance: Array, light: _Light, weight: Array, q: int, table: Any, extras: Any) -> tuple[Array, Array]:
     """What is to be taken away in each band (bands, pixels), and where that is above the threshold."""
     specular_part = weight * light.specular
-    if _adds(extras, q, bits):
+    if _adds(extras, q):
         amount = weight * (light.specular - light.back)
         above = np.abs(amount) >= table.negligible[q]
     else:
@@ -216,7 +213,7 @@ def _amount(
         if extras is not None and extras.method[q] == bits.RATIO:
             whole = light.specular + light.diffuse
             amount = np.maximum(reflectance, 0) * specular_part / np.where(whole > 0, whole, 1)
-    above &= (amount != 0) if _adds(extras, q, bits) else (specular_part > 0)
+    above &= (amount != 0) if _adds(extras, q) else (specular_part > 0)
     return np.where(above, amount, 0), above
 
 
@@ -226,7 +223,7 @@ def _noise(reflectance: Array, noise: Array) -> Array:
 
 
 def _sigma_removed(
-    reflectance: Array, light: _Light, weight: Array, pixels: _Pixels, table: Any, extras: Any, bits: Any
+    reflectance: Array, light: _Light, weight: Array, pixels: _Pixels, table: Any, extras: Any
 ) -> tuple[Array, Array]:
     """1 sigma of what is taken away, from material, directions and direct fraction; and of the image, what is left.
 
