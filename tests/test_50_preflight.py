@@ -128,9 +128,9 @@ def test_an_image_whose_blocks_do_not_fit_into_the_limit_is_told(tmp_path):
     write_raster(tmp_path / "class_map.tif", np.full((64, 64), TILE, np.uint8), cell=16.0)
     config = write_config(tmp_path, {"surface": None}, run={"memory_limit_mb": 400})
     (line,) = problems(config, ConfigError)
-    said = f"scene 'roofs' takes about 757 MB of memory, since the image {tmp_path}/image.tif is stored in blocks of"
+    said = f"scene 'roofs' takes about 808 MB of memory, since the image {tmp_path}/image.tif is stored in blocks of"
     assert line.startswith(f"{said} 2048 x 2048 pixels; [run] memory_limit_mb = 400: allow more")
-    allowed = write_config(tmp_path, {"surface": None}, run={"memory_limit_mb": 760})
+    allowed = write_config(tmp_path, {"surface": None}, run={"memory_limit_mb": 810})
     assert batch.plan(load_config(allowed), to_run=True)
 
 

@@ -68,12 +68,16 @@ def write_whole(path: Path, text: str) -> None:
 
 
 class Publication:
-    """A folder in the making: write into `.folder`, then `commit`. Leaving without a commit deletes it."""
+    """A folder in the making: write into `.folder`, then `commit`. Leaving without a commit deletes it.
 
-    def __init__(self, target: Path) -> None:
+    threads : that may be busy at a time, those which hash the files among them.
+    """
+
+    def __init__(self, target: Path, threads: int = 1) -> None:
         self.target = target
         self.folder = hidden_name(target, "part")
-        self._hasher = ThreadPoolExecutor(HASHING_THREADS)
+        self._threads = min(threads, HASHING_THREADS)
+        self._hasher = ThreadPoolExecutor(self._threads)
         self._hashes: dict[Path, Future[str]] = {}
 
     def __enter__(self) -> Self:
@@ -88,7 +92,11 @@ class Publication:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def hash_early(self, files: Iterable[Path]) -> None:
-        """Start to hash files of the folder that are whole, while others are still written."""
+        """Start to hash files of the folder that are whole, where a thread is free while others are still written."""
+        if self._threads > 1:
+            self._hash(files)
+
+    def _hash(self, files: Iterable[Path]) -> None:
         for path in files:
             self._hashes[path] = self._hasher.submit(sha256, path)
 
@@ -96,7 +104,7 @@ class Publication:
         """Write the manifest with the hashes of all files, flush, and take the target's place."""
         try:
             files = sorted(path for path in self.folder.iterdir() if path.name != MANIFEST)
-            self.hash_early(path for path in files if path not in self._hashes)
+            self._hash(path for path in files if path not in self._hashes)
             outputs = {
                 path.name: {"sha256": self._hashes[path].result(), "bytes": path.stat().st_size} for path in files
             }
@@ -151,17 +159,20 @@ def sha256(path: Path, stop: threading.Event | None = None) -> str:
 _KNOWN: dict[tuple[Path, int, int], str] = {}
 """hashes of the inputs of late by path, size and time of change: a surface model serves all scenes of a batch"""
 MOST_KNOWN = 64
+_knowing = threading.Lock()
+"""what several scenes share is read by the first of them while the others wait"""
 
 
 def _input_sha256(path: Path, stop: threading.Event) -> str:
     """SHA-256 of an input that is read once, unless it changes."""
     status = path.stat()
     version = path, status.st_size, status.st_mtime_ns
-    digest = _KNOWN.pop(version, None) or sha256(path, stop)
-    if not stop.is_set():
-        _KNOWN[version] = digest
-        while len(_KNOWN) > MOST_KNOWN:
-            del _KNOWN[next(iter(_KNOWN))]
+    with _knowing:
+        digest = _KNOWN.pop(version, None) or sha256(path, stop)
+        if not stop.is_set():
+            _KNOWN[version] = digest
+            while len(_KNOWN) > MOST_KNOWN:
+                del _KNOWN[next(iter(_KNOWN))]
     return digest
 
 

@@ -7,6 +7,7 @@ observer under D65, near-infrared false colour, or, where wavelengths are unknow
 come. Images are expected decimated; `linear_rgb` takes bands one by one, so a reader need not hold them all.
 """
 
+import threading
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
@@ -22,6 +23,8 @@ Style = Literal["true_colour", "false_colour"]
 
 VISIBLE_UM = (0.38, 0.78)
 FALSE_COLOUR_UM = {"near-infrared": (0.75, 1.00), "red": (0.60, 0.70), "green": (0.50, 0.60)}
+_importing = threading.Lock()
+"""scenes are drawn side by side, and one must not keep what another has changed"""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB, IEC 61966-2-1
 NO_DATA_GREY = 0.5
 
@@ -71,7 +74,7 @@ def _true_colour_matrix(centres_um: NDArray[np.float64], fwhm_um: NDArray[np.flo
     expanded to second order (van Cittert): 3 - 3 B + B^2. It undoes most of the blur, cannot amplify noise
     by more than 7 and keeps grey exactly grey.
     """
-    with np.printoptions():  # the package changes how numpy prints arrays, for everyone
+    with _importing, np.printoptions():  # the package changes how numpy prints arrays, for everyone
         import colour
 
     observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
@@ -325,7 +328,7 @@ def _write(image: Any, path: Path, file_format: str, colour_space: str) -> None:
         if not image.write(str(partial), fileformat=file_format):
             raise OutputError(f"{path}: {image.geterror() or geterror()}")
         written = ImageInput.open(str(partial))
-        if written is None or written.read_image() is None:
+        if written is None or written.read_image("uint8" if file_format == "png" else "half") is None:
             raise OutputError(f"{path}: written, but cannot be read again: {geterror()}")
         written.close()
         partial.replace(path)

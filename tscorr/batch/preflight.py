@@ -10,7 +10,8 @@ from pathlib import Path
 from tscorr import config, publish
 from tscorr.errors import ConfigError, OutputError, TscorrError
 from tscorr.scene.correct import is_current, target_of
-from tscorr.scene.forecast import available_mb, disk_bytes, memory_mb
+from tscorr.scene.cutting import memory_mb
+from tscorr.scene.forecast import available_mb, disk_bytes
 from tscorr.scene.plan import Scene
 
 log = logging.getLogger("tscorr")

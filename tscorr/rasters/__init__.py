@@ -7,13 +7,13 @@ from tscorr.rasters.decimated import LEAST_STEP, Means, decimated, read_decimate
 from tscorr.rasters.difference import expressible, write_difference
 from tscorr.rasters.envi_writing import ENVI_SUFFIX, EnviWriter
 from tscorr.rasters.header import (
-    ENVIRONMENT,
     IMAGE_TYPES,
     RasterInfo,
     can_hold,
     check_metric,
     check_overlap,
     describe,
+    environment,
     opened,
 )
 from tscorr.rasters.joining import join_rows, result
@@ -23,7 +23,6 @@ from tscorr.rasters.stored_tiles import StoredTiles
 from tscorr.rasters.writing import Layer, Writer, make_cog
 
 __all__ = [
-    "ENVIRONMENT",
     "ENVI_SUFFIX",
     "IMAGE_TYPES",
     "LEAST_STEP",
@@ -40,6 +39,7 @@ __all__ = [
     "check_overlap",
     "decimated",
     "describe",
+    "environment",
     "expressible",
     "join_rows",
     "make_cog",

@@ -5,12 +5,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
 from tscorr.grid import Block, blocks
-from tscorr.rasters.header import ENVIRONMENT, RasterInfo, opened
+from tscorr.rasters.header import RasterInfo, environment, opened
 from tscorr.rasters.reading import Reader
 
 Array = NDArray[Any]
@@ -38,7 +37,7 @@ def read_decimated(info: RasterInfo, max_size: int, bands: Sequence[int] | None 
                 filled[~np.isfinite(filled)] = np.nan
                 return filled
     means = Means(info.shape, shape, len(indexes))
-    with rasterio.Env(**ENVIRONMENT), Reader(info) as reader:
+    with environment(), Reader(info) as reader:
         for block in blocks(info.shape, _piece(info)):
             values = reader.read(block, indexes)
             missing = _missing(values, info.nodata)

@@ -1,5 +1,6 @@
 """What the header of a raster says, checked before a pixel is read."""
 
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -76,11 +77,32 @@ class RasterInfo:
         return self.profile["blockysize"], self.profile.get("blockxsize", self.shape[1])
 
 
+_entered = threading.local()
+
+
+@contextmanager
+def environment() -> Iterator[None]:
+    """GDAL's options, while files are read and written.
+
+    Held around the work on many files it makes each of them cheaper to open: within another one of the same thread
+    nothing is to be done. Where the main thread holds it, the threads that it waits for find the same size of cache.
+    """
+    if getattr(_entered, "here", False):
+        yield
+        return
+    with rasterio.Env(**ENVIRONMENT):
+        _entered.here = True
+        try:
+            yield
+        finally:
+            _entered.here = False
+
+
 @contextmanager
 def opened(path: Path, *, ours: bool = False) -> Iterator[Any]:
     """A dataset open for reading; InputError names the file where GDAL cannot."""
     try:
-        with rasterio.Env(**ENVIRONMENT), open_dataset(path, ours=ours) as dataset:
+        with environment(), open_dataset(path, ours=ours) as dataset:
             yield dataset
     except GDAL_ERRORS as error:
         raise InputError(f"{path} cannot be read: {reason_of(error, path)}") from None

@@ -10,13 +10,13 @@ from rasterio.errors import RasterioError
 from rasterio.shutil import copy as copy_raster
 
 from tscorr.errors import OutputError
-from tscorr.rasters.header import ENVIRONMENT, RasterInfo, describe
+from tscorr.rasters.header import RasterInfo, describe, environment
 
 
 def join_rows(parts: Sequence[Path], path: Path) -> None:
     """Write a VRT of rasters of equal width, bands and tags, top to bottom; all of them in the folder of `path`."""
     try:
-        with rasterio.Env(**ENVIRONMENT):
+        with environment():
             copy_raster(parts[0], path, driver="VRT")
             with rasterio.open(parts[0], sharing=False) as first:
                 tags = [first.tags(band, ns="IMAGERY") for band in first.indexes]

@@ -5,14 +5,13 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
-from tscorr.rasters.header import ENVIRONMENT, RasterInfo, reason_of
+from tscorr.rasters.header import RasterInfo, environment, reason_of
 from tscorr.rasters.sound import GDAL_ERRORS, open_dataset
 
 Array = NDArray[Any]
@@ -100,7 +99,7 @@ class Reader:
     def _dataset(self) -> Any:
         """The handle of the calling thread."""
         if not hasattr(self._local, "dataset"):
-            with rasterio.Env(**ENVIRONMENT):
+            with environment():
                 source = open_dataset(self.info.path, ours=self.info.ours)
                 dataset = source if self._aligned else self._warped(source)
             with self._lock:

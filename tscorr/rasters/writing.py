@@ -18,7 +18,7 @@ from tscorr.errors import OutputError
 from tscorr.grid import Block
 from tscorr.rasters import tiff
 from tscorr.rasters.encoding import Encoder, Tiles
-from tscorr.rasters.header import ENVIRONMENT, RasterInfo, tile_side
+from tscorr.rasters.header import ENVIRONMENT, RasterInfo, environment, tile_side
 from tscorr.rasters.stored_tiles import StoredTiles
 
 Array = NDArray[Any]
@@ -60,7 +60,7 @@ class Writer:
             np.dtype(layer.dtype),
         )
         try:
-            with rasterio.Env(**ENVIRONMENT), rasterio.open(path, "w", **options) as dataset:
+            with environment(), rasterio.open(path, "w", **options) as dataset:
                 _describe(dataset, layer, like)
                 planes = dataset.count if dataset.interleaving == Interleaving.band else 1
                 self._layout = tiff.Layout(dataset.shape, dataset.block_shapes[0], planes)
@@ -139,7 +139,7 @@ class Writer:
         zeros = np.zeros(0, np.uint8)
         block, expected = self._sample or (Block(0, 0, 0, 0), checksum(zeros))
         try:
-            with rasterio.Env(**ENVIRONMENT), rasterio.open(self.path, sharing=False) as dataset:
+            with environment(), rasterio.open(self.path, sharing=False) as dataset:
                 return checksum(dataset.read(window=block.window).data) == expected
         except RasterioError:
             return False

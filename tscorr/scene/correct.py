@@ -1,7 +1,5 @@
 """Correct a scene and publish its folder: rasters, picture, report, settings, manifest."""
 
-import resource
-import sys
 import time
 from collections.abc import Mapping
 from contextlib import closing
@@ -19,6 +17,8 @@ from tscorr.angles import relative_azimuth, true_azimuth, zenith_azimuth
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid, longitude_latitude
 from tscorr.report import SceneFacts, page, summary, write_json
+from tscorr.scene.cutting import threads_of
+from tscorr.scene.memory import give_back, peak_rss_mb
 from tscorr.scene.pictures import PICTURE_PX, Lights, draw_quicklook
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import written_products
@@ -90,11 +90,13 @@ def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
     with (
         closing(scene),
         publish.EarlyHashes(scene.inputs) as hashes,
-        publish.Publication(target_of(scene)) as publication,
+        publish.Publication(target_of(scene), threads_of(scene)) as publication,
     ):
         pipeline = Pipeline(scene, publication.folder)
-        pipeline.run(progress)
-        return finish(scene, publication, hashes, pipeline.sums, time.perf_counter() - started, pipeline.lights)
+        sums, lights = pipeline.run(progress), pipeline.lights
+        del pipeline  # and the heights that it keeps
+        give_back()
+        return finish(scene, publication, hashes, sums, time.perf_counter() - started, lights)
 
 
 def finish(
@@ -256,9 +258,3 @@ def _results(scene: Scene, folder: Path) -> dict[str, rasters.RasterInfo]:
 def _decimated_widths(results: Mapping[str, rasters.RasterInfo]) -> Array | None:
     info = results.get("azimuthal_width")
     return None if info is None else rasters.read_decimated(info, PICTURE_PX)[0]
-
-
-def peak_rss_mb() -> float:
-    """The most memory that this process has used so far. [MB]"""
-    unit = 1e6 if sys.platform == "darwin" else 1e3
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

@@ -7,9 +7,9 @@ import numpy as np
 
 from tscorr.correction import Corrector, class_rows
 from tscorr.scene.correct import is_current, view_samples
+from tscorr.scene.cutting import memory_mb, pixel_bytes, units_of
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import written_products
-from tscorr.scene.run import BASE_MB, pixel_bytes, units_of, work_bytes, workers_of
 from tscorr.scene.thresholds import by_threshold
 
 if TYPE_CHECKING:
@@ -77,12 +77,6 @@ def disk_bytes(scene: Scene) -> tuple[float, float]:
     codec = output.compression or image.profile["compress"]
     least = image_bytes if codec == "none" else min(image_bytes, image.path.stat().st_size)
     return (least if output.compression is None or codec == "none" else 0.0), most
-
-
-def memory_mb(scene: Scene) -> float:
-    """Memory that a scene takes, about: what does not grow with blocks, and a block for each worker."""
-    largest = max(block.height * block.width for block in units_of(scene))
-    return BASE_MB + workers_of(scene) * largest * work_bytes(scene.image) / 1e6
 
 
 def available_mb() -> float:

@@ -107,13 +107,15 @@ def _colours(scene: "Scene") -> tuple[tuple[float, ...], Array]:
 
 def _read_lights(scene: "Scene", matrix: Array, results: Mapping[str, rasters.RasterInfo]) -> tuple[Array, Array]:
     """Before and after, from the files."""
+    from tscorr.scene.cutting import threads_of
+
     used = quicklook.used_bands(matrix)
     scale, offset = scene.stored.scale, scene.stored.offset
 
     def light(info: rasters.RasterInfo) -> Array:
         return quicklook.linear_rgb(_reflectance(info, used, scale, offset, PICTURE_PX), matrix[used])
 
-    with ThreadPoolExecutor(2) as readers:  # to decode them is most of the work
+    with ThreadPoolExecutor(threads_of(scene)) as readers:  # to decode them is most of the work
         before, after = readers.map(light, (scene.image, results.get("corrected", scene.image)))
     return before, after
 

@@ -1,6 +1,5 @@
 """A scene from files to files: read, correct, write, in blocks, by several workers."""
 
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
@@ -28,9 +26,11 @@ from tscorr.correction import (
 )
 from tscorr.correction.edges import ShadowByBrightness
 from tscorr.correction.sigmas import SigmaTally
-from tscorr.grid import Block, blocks, north_of
+from tscorr.grid import Block, north_of
 from tscorr.scene.bad_bands import BadBands
+from tscorr.scene.cutting import threads_of, units_of, workers_of
 from tscorr.scene.ground import Ground
+from tscorr.scene.memory import keep_below
 from tscorr.scene.pictures import Lights
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import ANGLE_NAMES, write_corrected_vrt, writer_of, written_products
@@ -47,15 +47,8 @@ def silent(pixels: int) -> None:
     del pixels
 
 
-UNIT_COLUMNS = 2048
-STRIPE_COLUMNS = 6144
-BASE_MB = 380
-"""memory of the process before the first block, and of what does not grow with blocks"""
-COPIES = 5
-"""an image block and what is made of it, at most, in blocks of the image's own size"""
-GEOMETRY_BYTES = 60
-"""vectors, angles and masks of a pixel"""
-MOST_WORKERS = 4
+ANGLE_ROWS = 64
+"""rows whose angles are found at once: they are float64 meanwhile"""
 LEAST_CONFIDENCE = 0.5
 ANGLES_OF_SUN = {"incidence", "solar_zenith", "solar_azimuth"}
 
@@ -106,43 +99,6 @@ class Sums:
                 self.seconds[part] += time.perf_counter() - start
 
 
-def pixel_bytes(image: rasters.RasterInfo) -> int:
-    """Bytes of a pixel of the image, all bands."""
-    return image.bands * image.dtype.itemsize
-
-
-def work_bytes(image: rasters.RasterInfo) -> int:
-    """Memory that the work on a pixel takes at most."""
-    return COPIES * pixel_bytes(image) + GEOMETRY_BYTES
-
-
-def units(image: rasters.RasterInfo, memory_limit_mb: int, workers: int) -> list[Block]:
-    """Blocks that the work is cut into: whole tiles of the rasters that are written, stripe by stripe.
-
-    Results do not depend on the cut; memory and speed do. A block is never less than a tile, whatever the limit.
-    """
-    rows, cols = image.shape
-    tile_rows, tile_cols = image.written_tile
-    room = (memory_limit_mb - BASE_MB) * 1e6 / workers / work_bytes(image)  # pixels
-    widest = cols if tile_cols >= cols else max(1, UNIT_COLUMNS // tile_cols) * tile_cols
-    width = min(widest, max(1, int(room / tile_rows / tile_cols)) * tile_cols)
-    height = max(1, min(int(room / min(width, cols)), 512) // tile_rows) * tile_rows
-    stripe = max(width, STRIPE_COLUMNS // width * width)
-    return [
-        Block(block.row, first + block.col, block.height, block.width)
-        for first in range(0, cols, stripe)
-        for block in blocks((rows, min(stripe, cols - first)), (height, width))
-    ]
-
-
-def units_of(scene: Scene, strip: Block | None = None) -> list[Block]:
-    """The blocks of a scene, or of a strip of it, under its configuration's memory limit."""
-    limit, workers = scene.config.run.memory_limit_mb, workers_of(scene)
-    if strip is None:
-        return units(scene.image, limit, workers)
-    return [block.below(strip.row) for block in units(scene.image.crop(strip), limit, workers)]
-
-
 class Pipeline:
     """The work on one scene: open files, one method a block, and the rasters being written.
 
@@ -189,10 +145,10 @@ class Pipeline:
         if scene.confidence is not None:
             self._confidence = files.enter_context(rasters.Reader(scene.confidence, scene.grid, fill=float("nan")))
 
-    def run(self, progress: Progress) -> None:
-        """All blocks, by the workers of the configuration; the first error stops the rest."""
+    def run(self, progress: Progress) -> Sums:
+        """All blocks, by the workers of the configuration, and their sums; the first error stops the rest."""
         scene = self.scene
-        with rasterio.Env(**rasters.ENVIRONMENT), ExitStack() as files:
+        with rasters.environment(), ExitStack() as files:
             self.open(files)
             with self.sums.timed("geometry"):
                 self._prepare()
@@ -204,10 +160,11 @@ class Pipeline:
                 for writer in self.writers.values():
                     writer.abandon()
                 raise
-            with self.sums.timed("write"), ThreadPoolExecutor(workers_of(scene)) as pool:
+            with self.sums.timed("write"), ThreadPoolExecutor(threads_of(scene)) as pool:
                 list(pool.map(self._close, self.writers.items()))
             if self._as_difference and self._strip is None:
                 write_corrected_vrt(scene, self.folder)
+        return self.sums
 
     def _stored_tiles(self, files: ExitStack) -> rasters.StoredTiles | None:
         """The image's tiles as they are stored, where the corrected image can hold them; `files` closes them."""
@@ -276,6 +233,7 @@ class Pipeline:
         with self.sums.timed("write"):
             self._write(block, layers, stored)
         self.sums.add(result, rows, SHADOW_OR_NODATA if dark else None if idle is None else idle.reason)
+        keep_below(self.scene.config.run.memory_limit_mb)
         return rows.size
 
     @property
@@ -409,19 +367,27 @@ class Pipeline:
         if "azimuthal_width" in self._products:
             layers["azimuthal_width"] = self._azimuthal_width(inputs)[None]
         if "angles" in self._products:
-            angles = facet_angles(inputs.sun, inputs.view, inputs.normal)
-            for name, vectors in (("solar", inputs.sun), ("view", inputs.view)):
-                zenith, azimuth = zenith_azimuth(vectors)
-                constant = vectors.shape[1:] == (1, 1)  # then the direction was given for the centre
-                convergence = self.scene.sun.convergence_deg if constant else self._north.convergence_deg(block)
-                angles |= {f"{name}_zenith": zenith, f"{name}_azimuth": true_azimuth(azimuth, convergence)}
-            layers["angles"] = np.stack(
-                [np.broadcast_to(angles[name], block.shape).astype(np.float32) for name in ANGLE_NAMES]
-            )
+            layers["angles"] = np.empty((len(ANGLE_NAMES), *block.shape), np.float32)
+            for first in range(0, block.height, ANGLE_ROWS):
+                rows = slice(first, min(first + ANGLE_ROWS, block.height))
+                part = Block(block.row + first, block.col, rows.stop - first, block.width)
+                layers["angles"][:, rows] = self._angles(
+                    part, *(_rows_of(v, rows) for v in (inputs.sun, inputs.view, inputs.normal))
+                )
             if unseen is not None:
                 of_view = [i for i, name in enumerate(ANGLE_NAMES) if name not in ANGLES_OF_SUN]
                 layers["angles"][of_view] = np.where(unseen, np.float32(np.nan), layers["angles"][of_view])
         return layers
+
+    def _angles(self, block: Block, sun: Array, view: Array, normal: Array) -> Array:
+        """The angles of a block from its vectors, in the order of ANGLE_NAMES."""
+        angles = facet_angles(sun, view, normal)
+        for name, vectors in (("solar", sun), ("view", view)):
+            zenith, azimuth = zenith_azimuth(vectors)
+            constant = vectors.shape[1:] == (1, 1)  # then the direction was given for the centre
+            convergence = self.scene.sun.convergence_deg if constant else self._north.convergence_deg(block)
+            angles |= {f"{name}_zenith": zenith, f"{name}_azimuth": true_azimuth(azimuth, convergence)}
+        return np.stack([np.broadcast_to(angles[name], block.shape).astype(np.float32) for name in ANGLE_NAMES])
 
     def _azimuthal_width(self, inputs: BlockInputs) -> Array:
         """Azimuthal width of the peak for the material and incidence of each pixel, nan where none. [deg]"""
@@ -436,6 +402,11 @@ class Pipeline:
         return widths
 
 
+def _rows_of(vectors: Array, rows: slice) -> Array:
+    """Some rows of vectors (3, rows, cols), either of which may be one for all."""
+    return vectors if vectors.shape[1] == 1 else vectors[:, rows]
+
+
 def _doubtful(confidence: Array | None) -> Array | None:
     """Where the class is not known to be more likely right than wrong, or None where nobody says."""
     return None if confidence is None else ~(confidence >= LEAST_CONFIDENCE)
@@ -444,15 +415,6 @@ def _doubtful(confidence: Array | None) -> Array | None:
 def _weight(confidence: Array) -> Array:
     """The part of a pixel that is its material: as sure as its class is; all of it where that is not known."""
     return np.where(np.isnan(confidence), 1, np.clip(confidence, 0, 1)).astype(np.float32)
-
-
-def workers_of(scene: Scene) -> int:
-    """Threads that work on blocks: as configured, or all cores up to a few; no more than the memory limit feeds."""
-    run = scene.config.run
-    wanted = run.workers or min(MOST_WORKERS, len(os.sched_getaffinity(0)))
-    rows, cols = map(min, scene.image.tile, scene.image.shape)
-    tile_mb = rows * cols * work_bytes(scene.image) / 1e6
-    return max(1, min(wanted, int((run.memory_limit_mb - BASE_MB) / tile_mb)))
 
 
 def run_all(work: Callable[[Block], int], todo: list[Block], workers: int, progress: Progress) -> None:

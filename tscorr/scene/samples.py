@@ -22,8 +22,9 @@ from tscorr.fit.library import save_materials
 from tscorr.fit.scene_result import SceneFit
 from tscorr.fit.scenes import MIN_SAMPLES, SceneFitSettings, fit_samples
 from tscorr.grid import Block
+from tscorr.scene.cutting import units_of, workers_of
 from tscorr.scene.plan import Scene
-from tscorr.scene.run import Pipeline, Progress, run_all, silent, units_of, workers_of
+from tscorr.scene.run import Pipeline, Progress, run_all, silent
 
 Array = NDArray[Any]
 

@@ -24,11 +24,13 @@ import numpy as np
 from tscorr import publish, rasters
 from tscorr.correction import Corrector, add_tally, new_tally
 from tscorr.grid import Block, blocks
-from tscorr.scene.correct import check_unchanged, finish, peak_rss_mb, resume_key, target_of
+from tscorr.scene.correct import check_unchanged, finish, resume_key, target_of
+from tscorr.scene.cutting import units_of
 from tscorr.scene.ground import Ground
+from tscorr.scene.memory import peak_rss_mb
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import write_corrected_vrt, written_products
-from tscorr.scene.run import Pipeline, Progress, Sums, silent, units
+from tscorr.scene.run import Pipeline, Progress, Sums, silent
 
 MASKS, SUMS = "masks", "sums.json"
 
@@ -54,7 +56,7 @@ class Strips:
         rows, cols = self.scene.image.shape
         if self.scene.config.output.format == "envi":
             return [Block(0, 0, rows, cols)]
-        unit = units(self.scene.image, self.scene.config.run.memory_limit_mb, workers=1)[0].height
+        unit = units_of(self.scene, workers=1)[0].height
         most = max(unit, int(self.split_mpixel * 1e6 / cols) // unit * unit)
         equal = -(-rows // -(-rows // most))
         return list(blocks((rows, cols), (-(-equal // unit) * unit, cols)))
