@@ -65,7 +65,7 @@ def with_clear_errors(command: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-COMPILING = "tscorr: compiling for this machine, once: 10 to 20 s"
+COMPILING = "tscorr: compiling for this machine, once: up to half a minute"
 
 
 @contextmanager
