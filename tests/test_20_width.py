@@ -28,6 +28,7 @@ from tscorr.width import (
     lobe_shapes,
     peak_exitance,
     smallest_incidence,
+    typical_lobe,
     why_no_width,
     width_across,
     width_rows,
@@ -535,3 +536,10 @@ def test_share_of_a_heading_is_of_the_worst_band_and_of_the_direct_light():
 def test_heading_refuses_a_sun_below_the_horizon_and_an_impossible_view(zenith, field):
     with pytest.raises(InputError, match="allowed"):
         heading_table(zenith, 180, field, {})
+
+
+def test_the_typical_lobe_is_that_of_a_band_that_has_one():
+    """Bands that an image marks as bad have none."""
+    parameters = material("roof_tile").at(bands=5)
+    bad_middle = replace(parameters, t1=parameters.t1 * [1, 1, 0, 0, 1])
+    assert typical_lobe(bad_middle) == typical_lobe(parameters)

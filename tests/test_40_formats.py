@@ -167,6 +167,7 @@ def test_a_geotiff_becomes_envi_with_everything_that_a_header_can_hold(tmp_path)
     assert result.numbers("fwhm") == [0.02] * 3
     assert result.header["wavelength units"] == "Micrometers"
     assert result.header["reflectance scale factor"] == "10000"
+    assert result.header["description"].strip("{} \n") == "corrected.dat"
     info, before = rasters.describe(folder / "corrected.dat"), rasters.describe(image)
     for key in ("grid", "dtype", "nodata", "scales", "offsets", "names", "wavelengths_um", "fwhm_um"):
         assert getattr(info, key) == getattr(before, key), key
@@ -418,3 +419,10 @@ def test_flags_have_a_colour_table_and_a_legend_of_what_occurs(tmp_path):
 def test_a_legend_names_the_flags_that_no_colour_tells():
     (entry,) = ET.fromstring(flag_style([(1 << 6) | PixelFlag.CLIPPED])).iter("paletteEntry")
     assert entry.get("label") == "corrected: CLIPPED"
+
+
+@pytest.mark.parametrize("interleave", AXES)
+def test_a_block_of_many_bands_fits_the_memory_limit(tmp_path, interleave):
+    """300 bands of 16 bits: a tile of 512 x 512 would be 157 MB, and five copies of it are made."""
+    image = write_envi(tmp_path / "x.dat", np.ones((300, 20, 600), np.int16), interleave)
+    assert rasters.describe(image).written_tile == (16, 512)

@@ -1,6 +1,8 @@
 """cli: commands, exit codes, and one clear message for everything that can be wrong before work starts."""
 
+import io
 import json
+import logging
 import os
 import shutil
 import signal
@@ -580,3 +582,30 @@ def test_plan_and_report_agree_on_the_views():
         "scenes"
     ][1]
     assert planned["view_zenith_deg"] == pytest.approx([0.0, 11.4, 22.6], abs=0.6)  # the sample's README
+
+
+@pytest.mark.parametrize(
+    ("classes", "keys", "said"),
+    [
+        ({"7": "roof_tile"}, {}, "roofs: nothing was assessed: no class of [materials.classes] occurs where"),
+        ({str(TILE): "roof_tile"}, {"saturation": 0.9}, "roofs: every pixel is saturated: is `saturation` in stored"),
+    ],
+)
+def test_what_can_hardly_be_meant_is_said(tmp_path, classes, keys, said):
+    small_scene(tmp_path)
+    result = tscorr("run", write_config(tmp_path, keys, materials={"classes": classes}))
+    assert (result.exit_code, said in result.stdout) == (0, True)
+
+
+def test_a_program_that_logs_everything_hears_of_warnings_only(tmp_path):
+    """As rio does, which has this as a plug-in: its handler takes what comes."""
+    config = small_scene(tmp_path)
+    tscorr("run", config)
+    heard = io.StringIO()
+    handler = logging.StreamHandler(heard)
+    logging.getLogger().addHandler(handler)
+    try:
+        assert "nothing to do" in tscorr("run", config).stdout
+    finally:
+        logging.getLogger().removeHandler(handler)
+    assert heard.getvalue() == ""

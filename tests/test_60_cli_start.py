@@ -224,6 +224,13 @@ def test_quicklook_in_false_colour_shows_the_infrared_as_red(grey, tmp_path):
     np.testing.assert_allclose(colour[..., 1:], 0.461, atol=0.003)
 
 
+@pytest.mark.parametrize("exposure", ["nan", "inf"])
+def test_an_exposure_is_a_number(grey, tmp_path, exposure):
+    result = tscorr("quicklook", grey, "-o", tmp_path / "x.png", "--exposure", exposure)
+    assert result.exit_code == 2
+    assert f"exposure = {exposure}; allowed is a number above 0" in result.stderr
+
+
 def test_quicklook_refuses_what_it_cannot_draw(grey, tmp_path):
     write_image(tmp_path / "rgb.tif")
     cases = {

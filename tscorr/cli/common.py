@@ -41,16 +41,29 @@ def stoppable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+@contextmanager
+def warnings_told() -> Iterator[None]:
+    """Warnings on stderr, and nothing less, whatever a program that calls this one does with its log."""
+    console = logging.StreamHandler(sys.stderr)
+    console.setLevel(logging.WARNING)
+    console.setFormatter(logging.Formatter("tscorr: %(message)s"))
+    log = logging.getLogger("tscorr")
+    log.addHandler(console)
+    before, log.propagate = log.propagate, False
+    try:
+        yield
+    finally:
+        log.propagate = before
+        log.removeHandler(console)
+
+
 def with_clear_errors(command: Callable[..., Any]) -> Callable[..., Any]:
     """A command whose errors are one message on stderr and an exit code."""
 
     @functools.wraps(command)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
-        console = logging.StreamHandler(sys.stderr)
-        console.setLevel(logging.WARNING)
-        logging.basicConfig(format="tscorr: %(message)s", handlers=[console])
         try:
-            with stoppable():
+            with stoppable(), warnings_told():
                 return command(*args, **kwargs)
         except TscorrError as error:
             for line in str(error).splitlines():
@@ -59,7 +72,8 @@ def with_clear_errors(command: Callable[..., Any]) -> Callable[..., Any]:
         except KeyboardInterrupt as error:
             number = signal.SIGTERM if isinstance(error, Stopped) else signal.SIGINT
             what = "terminated" if number == signal.SIGTERM else "interrupted"
-            click.echo(f"tscorr: {what}; what was finished stays, the rest is done by the next run", err=True)
+            rest = "with --overwrite again" if kwargs.get("overwrite") else "the rest is done by the next run"
+            click.echo(f"tscorr: {what}; what was finished stays, {rest}", err=True)
             sys.exit(SIGNALLED + number)
 
     return wrapped

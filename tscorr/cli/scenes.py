@@ -93,6 +93,7 @@ def print_outcome(result: "BatchResult") -> None:
                 f"(RMS of reflectance against the truth)"
                 + (f": {residual['ratio']:.3f} of it is left" if residual["ratio"] is not None else "")
             )
+        notes += [f"{scene.name}: {doubt}" for doubt in doubts(report["pixels"])]
         if bad := report.get("bad_bands"):
             notes.append(f"{scene.name}: {left_alone(bad)}")
         if scene.state == "current":
@@ -103,6 +104,16 @@ def print_outcome(result: "BatchResult") -> None:
     here = Path.cwd()
     folder = result.folder.relative_to(here) if result.folder.is_relative_to(here) else result.folder
     click.echo(f"results: {folder}")
+
+
+def doubts(pixels: dict[str, int]) -> list[str]:
+    """What can hardly be meant, from the pixel counts of a report."""
+    found = []
+    if 0 < pixels["valid"] == pixels["no_material"]:
+        found.append("nothing was assessed: no class of [materials.classes] occurs where the image has data")
+    if 0 < pixels["valid"] == pixels["saturated"]:
+        found.append("every pixel is saturated: is `saturation` in stored values?")
+    return found
 
 
 def left_alone(bad: Sequence[str]) -> str:

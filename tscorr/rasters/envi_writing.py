@@ -53,6 +53,8 @@ class EnviWriter:
         try:  # what a header cannot hold shall not go to a file beside it
             with rasterio.Env(**ENVIRONMENT, GDAL_PAM_ENABLED="NO"), rasterio.open(path, "w", **options) as dataset:
                 _describe(dataset, layer, like)
+            header = path.with_suffix(".hdr")  # GDAL puts the path into it, which is that of a hidden folder
+            header.write_bytes(header.read_bytes().replace(bytes(path), path.name.encode()))
             self._file = os.open(path, os.O_RDWR)
         except (RasterioError, OSError) as error:
             raise OutputError(f"{path} cannot be written: {error}") from None

@@ -21,6 +21,7 @@ from tscorr.rasters.sound import GDAL_ERRORS, check_sound, open_dataset
 IMAGE_TYPES = ("uint8", "int16", "uint16", "float32")
 TILE_BYTES = 8e6
 """what is stored together in new files at most"""
+TILE_COLS = 512
 ENVIRONMENT = {"GDAL_CACHEMAX": 32 << 20, "GDAL_NUM_THREADS": "1", "GDAL_VRT_ENABLE_PYTHON": "NO"}
 """options for GDAL; rasterio takes the size of its cache in bytes, whatever GDAL's manual says, and it is of the whole
 process: where nobody sets it around the reading of many blocks, it grows to a twentieth of the machine's memory"""
@@ -164,15 +165,22 @@ def tile_side(pixel_bytes: int) -> int:
     return min(512, max(64, side // 16 * 16))
 
 
+def tile_rows(pixel_bytes: int) -> int:
+    """Rows of a tile of TILE_COLS that a block of all bands can be cut into: less of them where there are many bands.
+
+    Wide and low, since files that are no GeoTIFF hold whole lines together.
+    """
+    return min(512, max(16, int(TILE_BYTES / pixel_bytes / TILE_COLS) // 16 * 16))
+
+
 def _profile(dataset: Any) -> dict[str, Any]:
     """Tiling, interleave and codec of a GeoTIFF; a tiled one with a fast codec for other formats."""
     structure = dataset.tags(ns="IMAGE_STRUCTURE")
     rows, cols = dataset.block_shapes[0]
     profile: dict[str, Any] = {"interleave": "pixel" if dataset.interleaving == Interleaving.pixel else "band"}
     if dataset.driver != "GTiff":
-        together = dataset.count if profile["interleave"] == "pixel" else 1
-        side = tile_side(together * np.dtype(dataset.dtypes[0]).itemsize)
-        return {**profile, "tiled": True, "blockxsize": side, "blockysize": side, "compress": "zstd"}
+        rows = tile_rows(dataset.count * np.dtype(dataset.dtypes[0]).itemsize)
+        return {**profile, "tiled": True, "blockxsize": TILE_COLS, "blockysize": rows, "compress": "zstd"}
     if cols < dataset.width or rows % 16 == 0 == cols % 16:
         profile |= {"tiled": True, "blockxsize": cols, "blockysize": rows}
     else:

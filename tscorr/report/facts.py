@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tscorr.materials import BandParameters, Material
-from tscorr.width import LobeShape, lobe_shapes
+from tscorr.width import LobeShape, typical_lobe
 
 if TYPE_CHECKING:
     from tscorr.correction import Rules
@@ -70,9 +70,8 @@ class SceneFacts:
     """how sure the corrected values are; None where nobody asked"""
 
     def lobe(self, row: int) -> LobeShape:
-        """The lobe that stands for a material in widths and plots: that of the middle band."""
-        shapes = lobe_shapes(self.materials[row][1])
-        return shapes[len(shapes) // 2]
+        """The lobe that stands for a material in widths and plots."""
+        return typical_lobe(self.materials[row][1])
 
     def views(self) -> tuple[Array, Array, Array]:
         """View zenith, view azimuth and relative azimuth of the finite samples, flat. [deg]"""

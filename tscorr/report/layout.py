@@ -88,12 +88,12 @@ def _header(report: Report) -> str:
 
 def _tiles(report: Report) -> str:
     pixels, sun, view = report["pixels"], report["sun"], report["view"]
-    touched = (pixels["corrected"] + pixels["uncorrectable"]) / max(pixels["total"], 1)
+    touched = (pixels["corrected"] + pixels["uncorrectable"]) / max(pixels["valid"], 1)
     drift = sun["drift_deg_per_hour"]
     low, median, high = view["zenith_deg"]
     tiles = [
         tile(
-            "Pixels with something removed",
+            "Pixels with something to remove",
             percent(touched),
             f"{count(pixels['corrected'])} corrected, {count(pixels['uncorrectable'])} beyond correction",
         ),

@@ -121,7 +121,7 @@ def _header(title: str, scenes: Sequence[SceneLine], version: str) -> str:
     )
     tiles = (
         tile("Scenes", count(len(scenes)), f"{len(failed)} failed" if failed else "none failed"),
-        tile("Pixels with something removed", percent((corrected + lost) / max(1, pixels)), f"of {count(pixels)}"),
+        tile("Pixels with something to remove", percent((corrected + lost) / max(1, pixels)), f"of {count(pixels)}"),
         tile("Beyond correction", count(lost), f"{percent(lost / max(1, pixels), 1)} of the pixels"),
         tile("Time", f"{sum(report['seconds']['wall'] or 0 for report in reports):.0f} s", "for all scenes"),
     )

@@ -137,6 +137,8 @@ def draw_image(
     kind = output.suffix.lower()
     if kind not in {".png", ".exr"}:
         raise InputError(f"the picture {output} ends in '{output.suffix}'; allowed are .png and .exr")
+    if exposure is not None and not 0 < exposure < float("inf"):
+        raise InputError(f"exposure = {exposure}; allowed is a number above 0")
     if output.resolve() == image.resolve():
         raise InputError(f"the picture {output} is the image itself; name another")
     info = rasters.describe(image)

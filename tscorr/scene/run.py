@@ -35,7 +35,7 @@ from tscorr.scene.pictures import Lights
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import ANGLE_NAMES, write_corrected_vrt, writer_of, written_products
 from tscorr.scene.skipping import SHADOW_OR_NODATA, Idle, Skipping, tallied
-from tscorr.width import lobe_shapes, width_table
+from tscorr.width import typical_lobe, width_table
 
 Array = NDArray[Any]
 Progress = Callable[[int], None]
@@ -130,9 +130,8 @@ class Pipeline:
         self._skipping = Skipping(scene, self.corrector.peaks)
         self._north = north_of(scene.grid)
         self._tables = [
-            width_table(shapes[len(shapes) // 2], rules.form) if peak else None
+            width_table(typical_lobe(parameters), rules.form) if peak else None
             for (_, parameters, rules), peak in zip(scene.materials, self.corrector.peaks[1:], strict=True)
-            for shapes in [lobe_shapes(parameters)]
         ]
 
     def open(self, files: ExitStack) -> None:

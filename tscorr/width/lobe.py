@@ -69,6 +69,13 @@ def lobe_shapes(parameters: BandParameters) -> tuple[LobeShape, ...]:
     )
 
 
+def typical_lobe(parameters: BandParameters) -> LobeShape:
+    """The lobe that stands for a material in widths and plots: that of the middle one of the bands that have it."""
+    shapes = lobe_shapes(parameters)
+    strong = [shape for shape in shapes if shape.t1 > 0] or shapes
+    return strong[len(strong) // 2]
+
+
 def is_simplified(form: str) -> bool:
     """Whether `form` drops the geometric attenuation factor; ConfigError where it is no form."""
     if form not in {"full", "simplified"}:
