@@ -2,7 +2,8 @@
 
 Scenes of 512 x 512 pixels lie in flight lines that overlap by a quarter, over one surface model and one class map.
 Times are of the processor, so that other programs do not lengthen them. Work is reading, geometry,
-kernel and writing; overhead is the rest of the batch: planning, reports, previews, manifests, the pages of the batch.
+kernel and writing; report is the scene's page and picture; overhead is the rest of the batch: planning, files opened
+and described, manifests, the pages of the batch. The last column is the wall time of one worker over that of two.
 """
 
 import resource
@@ -10,7 +11,7 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from unittest import mock
 
@@ -21,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from small_scene import CELL, NORTH, SCALE, SCENE, WEST, write_config, write_raster
 
 from tscorr import batch
+from tscorr.scene import correct
 from tscorr.scene.run import Sums, silent
 
 SIDE, STEP, ACROSS = 512, 384, 20
@@ -57,6 +59,7 @@ class Footprint:
 
     def __init__(self):
         self.rss_mb, self.files, self.threads, self.yardstick = [], [], [], []
+        self.report_s = 0.0
 
     def __call__(self, scene):
         """The `progress` of a batch."""
@@ -74,6 +77,18 @@ class Footprint:
     def slowness(self):
         """How much longer the same computation took on average than at best: what other programs cost this one."""
         return float(np.mean(self.yardstick) / np.min(self.yardstick))
+
+    def counting(self, draw):
+        """A function whose processor time is that of the reports."""
+
+        def drawn(*args, **kwargs):
+            start = time.thread_time()
+            try:
+                return draw(*args, **kwargs)
+            finally:
+                self.report_s += time.thread_time() - start
+
+        return drawn
 
     def growth_mb(self, warm_up):
         """Memory that a scene adds, as the slope over all scenes after the first ones. [MB]"""
@@ -94,14 +109,25 @@ def processor_time(self, part):
 def measured(config, **options):
     """Run a batch: its result, its footprint, and work and overhead a scene. [ms of processor time at its best]"""
     footprint = Footprint()
-    with mock.patch.object(Sums, "timed", processor_time):
+    with ExitStack() as patches:
+        patches.enter_context(mock.patch.object(Sums, "timed", processor_time))
+        for name in ("summary", "page", "draw_quicklook"):
+            draw = footprint.counting(getattr(correct, name))
+            patches.enter_context(mock.patch.object(correct, name, draw))
         start = time.process_time()
         result = batch.run(config, progress=footprint, **options)
         total = time.process_time() - start
     stages = "read", "geometry", "kernel", "write"
     work = sum(scene.report["seconds"][stage] for scene in result.scenes for stage in stages)
     a_scene = 1e3 / len(result.scenes) / footprint.slowness
-    return result, footprint, a_scene * work, a_scene * (total - work)
+    return result, footprint, a_scene * work, a_scene * (total - work - footprint.report_s)
+
+
+def seconds(config, workers):
+    """Wall time of a batch."""
+    start = time.perf_counter()
+    batch.run(config, overwrite=True, workers=workers)
+    return time.perf_counter() - start
 
 
 @click.command()
@@ -109,7 +135,9 @@ def measured(config, **options):
 @click.option("--profile", is_flag=True, help="Where the time of the last batch goes.")
 def main(numbers, profile):
     """Print work and overhead a scene, and what grows."""
-    click.echo("products          scenes  work ms  overhead ms  again ms  MB a scene  files  threads  slowness")
+    click.echo(
+        "products          scenes  work ms  report ms  overhead ms  again ms  MB a scene  files  threads  slow  1 / 2"
+    )
     kinds = {"default": {}, "corrected, flags": {"products": ("corrected", "flags"), "quicklook": False}}
     for (name, options), number in ((kind, number) for kind in kinds.items() for number in numbers):
         with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
@@ -127,11 +155,13 @@ def main(numbers, profile):
             start = time.process_time()
             batch.run(config)
             again = 1e3 * (time.process_time() - start) / number / footprint.slowness
+            report = 1e3 * footprint.report_s / number / footprint.slowness
+            gain = seconds(config, workers=1) / seconds(config, workers=2)
         grown = footprint.files[-1] - footprint.files[1], max(footprint.threads) - footprint.threads[1]
         click.echo(
-            f"{name:<16}  {number:6}  {work:7.1f}  {overhead:11.1f}  {again:8.1f}  "
+            f"{name:<16}  {number:6}  {work:7.1f}  {report:9.1f}  {overhead:11.1f}  {again:8.1f}  "
             f"{footprint.growth_mb(min(10, number // 2)):10.3f}  {grown[0]:+5}  {grown[1]:+7}  "
-            f"{footprint.slowness:8.2f}"
+            f"{footprint.slowness:4.2f}  {gain:5.2f}"
         )
 
 

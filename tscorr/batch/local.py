@@ -2,9 +2,11 @@
 
 import json
 import logging
+import threading
 import time
 from collections.abc import Iterable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from typing import Self
 
 from tscorr import rasters
 from tscorr.batch.outcome import SceneOutcome, SceneProgress
@@ -32,16 +34,49 @@ def outcomes(planned: Sequence[Scene], overwrite: bool, progress: SceneProgress)
             found[future.result().name] = future.result()
 
     most = max((wanted_workers(scene) for scene in planned), default=1)
-    with rasters.environment(), ThreadPoolExecutor(most) as pool:
+    with rasters.environment(), ThreadPoolExecutor(most) as pool, _Crew() as crew:
         for scene in planned:
             while running and not _fit([*running.values(), scene]):
                 collect(wait(running, return_when=FIRST_COMPLETED).done)
             if _is_large(scene):
                 found[scene.name] = _outcome(scene, overwrite, progress)
             else:
-                running[pool.submit(_outcome, scene, overwrite, progress)] = scene
+                running[pool.submit(crew.done, scene, overwrite, progress)] = scene
         collect(wait(running).done)
     return [found[scene.name] for scene in planned]
+
+
+class _Crew:
+    """The threads that work on scenes; leaving it waits for them, whatever ended the batch.
+
+    A pool forgets the thread that it was about to start when a signal came.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._active = 0
+        self._ended = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._ended = True
+            self._changed.wait_for(lambda: self._active == 0)
+
+    def done(self, scene: Scene, overwrite: bool, progress: SceneProgress) -> SceneOutcome:
+        """The outcome of a scene; CancelledError where the batch ended before its turn came."""
+        with self._changed:
+            if self._ended:
+                raise CancelledError
+            self._active += 1
+        try:
+            return _outcome(scene, overwrite, progress)
+        finally:
+            with self._changed:
+                self._active -= 1
+                self._changed.notify_all()
 
 
 def _is_large(scene: Scene) -> bool:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -434,7 +435,15 @@ def _heights(settings: Any, files: tuple[rasters.RasterInfo, ...]) -> tuple[floa
     dsm = next((info for info in files if info.bands == 1), None)
     if dsm is None:
         return 0.0, 0.0
-    heights = rasters.read_samples(dsm, HEIGHT_WINDOWS, HEIGHT_WINDOW_PX)
+    status = dsm.path.stat()
+    return _coarse_heights(dsm.path, (status.st_size, status.st_mtime_ns))
+
+
+@lru_cache(maxsize=64)  # a surface model serves all the scenes of a batch
+def _coarse_heights(path: Path, version: tuple[int, int]) -> tuple[float, float]:
+    """Middle and highest height of one version of a file: its size and time of change. [m]"""
+    del version
+    heights = rasters.read_samples(rasters.describe(path), HEIGHT_WINDOWS, HEIGHT_WINDOW_PX)
     if not heights.size:
-        raise InputError(f"the surface model {dsm.path} holds no heights at all")
+        raise InputError(f"the surface model {path} holds no heights at all")
     return float(np.median(heights)), float(heights.max())
