@@ -220,8 +220,8 @@ def memory(bench):
     shapes = {
         "square": {"rows": bench.size, "cols": bench.size},
         "six times as wide": {"rows": bench.size // 8, "cols": 6 * bench.size},
-        "60 bands, by band": {"rows": bench.size // 5, "bands": 60, "interleave": "band"},
-        "300 bands, by band": {"rows": bench.size // 10, "bands": 300, "interleave": "band"},
+        "60 bands, by band, tiles of 128": {"rows": bench.size // 5, "bands": 60, "interleave": "band", "tile": 128},
+        "300 bands, by band, tiles of 64": {"rows": bench.size // 10, "bands": 300, "interleave": "band", "tile": 64},
         "300 bands, by pixel, tiles of 64": {"rows": bench.size // 10, "bands": 300, "tile": 64},
     }
     for name, shape in shapes.items():
@@ -250,7 +250,7 @@ def growth(bench):
         )
     value = per_pixel[bench.size].cpu_s / bench.size**2 / 4
     for bands, side in ((60, bench.size // 5), (300, bench.size // 10)):
-        with bench.city(rows=side, bands=bands, interleave="band", codec="zstd") as image:
+        with bench.city(rows=side, bands=bands, interleave="band", codec="zstd", tile=64) as image:
             config = write_config(image)
             times = bench.timed(run=partial(run, config))["run"]
         yield Ratio(f"CPU time of a value, {bands} / 4 bands", times.cpu_s / side**2 / bands / value)

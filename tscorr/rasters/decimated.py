@@ -102,12 +102,14 @@ class Cells:
 class Means:
     """Means over coarse cells, from blocks in any order and of any thread.
 
-    fine, coarse : of the cells. layers : how many are averaged.
+    fine, coarse : of the cells. layers : how many are averaged. counted : 1 where all have values in the same pixels.
     """
 
-    def __init__(self, fine: tuple[int, int], coarse: tuple[int, int], layers: int) -> None:
+    def __init__(
+        self, fine: tuple[int, int], coarse: tuple[int, int], layers: int, counted: int | None = None
+    ) -> None:
         self.cells = Cells(fine, coarse)
-        self._total, self._count = np.zeros((2, layers, *coarse))
+        self._total, self._count = np.zeros((layers, *coarse)), np.zeros((counted or layers, *coarse), np.float32)
         self._lock = threading.Lock()
 
     def add(self, block: Block, sums: Array, counts: Array) -> None:

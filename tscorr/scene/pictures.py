@@ -41,7 +41,7 @@ class Lights:
         self._weights = weights * np.array(scene.stored.scale)[self._used]
         self._dark = weights @ np.array(scene.stored.offset)[self._used]
         thinned = -(-scene.image.shape[0] // self._stride), scene.image.shape[1]
-        self._before, self._after = (rasters.Means(thinned, shape, 3) for _ in range(2))
+        self._before, self._after = (rasters.Means(thinned, shape, 3, counted=1) for _ in range(2))
 
     @classmethod
     def of(cls, scene: "Scene") -> Self | None:
