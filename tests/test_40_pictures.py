@@ -29,7 +29,7 @@ CLASSES = {str(TILE): "roof_tile", str(METAL): "red_aluminum", str(GROUND): "lam
 def gathered(folder, monkeypatch, *, side=COARSE, unit=32, **sections):
     """Before and after as the blocks of the scene showed them, and the same from the files."""
     monkeypatch.setattr(pictures, "PICTURE_PX", side)
-    monkeypatch.setattr("tscorr.scene.run.UNIT_COLUMNS", unit)
+    monkeypatch.setattr("tscorr.scene.cutting.UNIT_COLUMNS", unit)
     config = write_config(folder, output={"directory": "out", "quicklook": True}, **sections)
     (scene,) = batch.plan(load_config(config))
     target = folder / "files"

@@ -24,7 +24,7 @@ TILED = {"blockxsize": SIDE, "blockysize": SIDE}
 @pytest.fixture(autouse=True)
 def small_units(monkeypatch):
     """Four units where there would be one."""
-    monkeypatch.setattr("tscorr.scene.run.UNIT_COLUMNS", UNIT[1])
+    monkeypatch.setattr("tscorr.scene.cutting.UNIT_COLUMNS", UNIT[1])
 
 
 def write_scene(folder, dtype="int16", nodata=None, **profile):
