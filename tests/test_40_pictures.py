@@ -36,7 +36,10 @@ def gathered(folder, monkeypatch, *, side=COARSE, unit=32, **sections):
     target.mkdir()
     pipeline = Pipeline(scene, target)
     pipeline.run(lambda _: None)
-    return pipeline.lights.images(), [read(scene, path, side) for path in (scene.image.path, target / "corrected.tif")]
+    matrix = rgb_matrix(scene.wavelengths_um or [np.nan] * scene.image.bands, scene.image.fwhm_um)
+    return pipeline.lights.images(matrix), [
+        read(scene, path, side) for path in (scene.image.path, target / "corrected.tif")
+    ]
 
 
 def read(scene, path, side):

@@ -56,14 +56,28 @@ def rgb_matrix(wavelengths_um: ArrayLike, fwhm_um: ArrayLike | None = None, styl
     if strange.size:
         raise InputError(f"band wavelength {strange[0]:g} um; above 0 and up to 100 um is allowed")
     matrix = np.zeros((centres.size, 3))
-    visible = (centres >= VISIBLE_UM[0]) & (centres <= VISIBLE_UM[1])
+    shown = shown_bands(centres)
     if style == "false_colour":
         matrix[_false_colour_bands(centres), [0, 1, 2]] = 1.0
-    elif visible.any():
-        matrix[visible] = _true_colour_matrix(centres[visible], widths[visible])
+    elif _visible(centres).any():
+        matrix[shown] = _true_colour_matrix(centres[shown], widths[shown])
     else:
-        matrix[[0, 1, 2] if centres.size >= 3 else [0, 0, 0], [0, 1, 2]] = 1.0
+        matrix[shown if len(shown) == 3 else shown * 3, [0, 1, 2]] = 1.0
     return matrix.astype(np.float32)
+
+
+def shown_bands(wavelengths_um: ArrayLike) -> list[int]:
+    """Indices of the bands that true colour can show: the visible ones, else the first three, or the first as grey.
+
+    Tells without colour-science, which takes 100 MB of memory.
+    """
+    centres = np.atleast_1d(np.asarray(wavelengths_um, dtype=float))
+    visible = np.flatnonzero(_visible(centres)).tolist()
+    return visible or ([0, 1, 2] if centres.size >= 3 else [0])
+
+
+def _visible(centres_um: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return (centres_um >= VISIBLE_UM[0]) & (centres_um <= VISIBLE_UM[1])
 
 
 def _true_colour_matrix(centres_um: NDArray[np.float64], fwhm_um: NDArray[np.float64]) -> NDArray[np.float64]:

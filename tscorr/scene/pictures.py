@@ -21,48 +21,45 @@ PICTURE_PX = 768
 """the longer side of a panel"""
 PREVIEW_PX = 2048
 """the longer side of a picture of one image, unless asked for otherwise"""
+MOST_GATHERED = 8
+"""bands of which before and after are kept beside the work: 9 MB each"""
 BANDS_AT_ONCE = 8
 """bands of one file are read together: where they are stored together, each piece is then decoded once"""
 
 
 class Lights:
-    """Before and after of a scene in linear light, gathered from its blocks: no file need be decoded for them again.
+    """Before and after of a scene, made small, gathered from its blocks: no file need be decoded for them again.
 
     Of a large image every so many rows count. Any thread may ask and add.
     """
 
     def __init__(self, scene: "Scene") -> None:
         self._stored = scene.stored
+        self._bands = _shown(scene)
         shape, step = rasters.decimated(scene.image.shape, PICTURE_PX)
         self._stride = max(1, int(step) // rasters.LEAST_STEP)
-        _, matrix = _colours(scene)
-        self._used = quicklook.used_bands(matrix)
-        weights = matrix[self._used].T
-        self._weights = weights * np.array(scene.stored.scale)[self._used]
-        self._dark = weights @ np.array(scene.stored.offset)[self._used]
         thinned = -(-scene.image.shape[0] // self._stride), scene.image.shape[1]
-        self._before, self._after = (rasters.Means(thinned, shape, 3, counted=1) for _ in range(2))
+        self._before, self._after = (rasters.Means(thinned, shape, len(self._bands), counted=1) for _ in range(2))
 
     @classmethod
     def of(cls, scene: "Scene") -> Self | None:
-        """None where no picture is asked for, or the files are so small that they can be read again."""
+        """None where no picture is asked for, the files are small and soon read again, or too many bands are shown."""
         _, step = rasters.decimated(scene.image.shape, PICTURE_PX)
-        return cls(scene) if scene.config.output.quicklook and step >= rasters.LEAST_STEP else None
+        wanted = scene.config.output.quicklook and step >= rasters.LEAST_STEP
+        return cls(scene) if wanted and len(_shown(scene)) <= MOST_GATHERED else None
 
     def of_block(self, block: Block, image: Array) -> tuple[Array, Array]:
-        """Light of a block (bands, rows, cols) of stored values: its sums over cells, and of how many pixels."""
+        """Sums over cells of the stored values of a block (bands, rows, cols), and of how many pixels they are."""
         thin, cells = self._thinned(block), self._before.cells
         rows = slice(-block.row % self._stride, None, self._stride)
-        values = np.stack([image[band, rows] for band in self._used])
+        values = np.stack([image[band, rows] for band in self._bands])
         missing = ~np.isfinite(values).all(axis=0)
         if self._stored.has_nodata:
             missing |= (values == self._stored.nodata).any(axis=0)
-        if missing.any():
-            values[:, missing] = 0
-            counts = cells.sums(thin, ~missing[None])
-        else:
-            counts = cells.sizes(thin)
-        return np.tensordot(self._weights, cells.sums(thin, values), 1) + self._dark[:, None, None] * counts, counts
+        if not missing.any():
+            return cells.sums(thin, values), cells.sizes(thin)
+        values[:, missing] = 0
+        return cells.sums(thin, values), cells.sums(thin, ~missing[None])
 
     def add(self, block: Block, before: tuple[Array, Array], after: tuple[Array, Array]) -> None:
         """Add a block, as `of_block` saw it before and after the correction."""
@@ -70,9 +67,15 @@ class Lights:
         self._before.add(thin, *before)
         self._after.add(thin, *after)
 
-    def images(self) -> tuple[Array, Array]:
-        """Before and after: linear sRGB (rows, cols, 3), nan without data."""
-        return np.moveaxis(self._before.values(), 0, 2), np.moveaxis(self._after.values(), 0, 2)
+    def images(self, matrix: Array) -> tuple[Array, Array]:
+        """Before and after in linear light (rows, cols, 3), nan without data; by a matrix of `rgb_matrix`."""
+        scale, offset = np.array([self._stored.scale, self._stored.offset], np.float32)[:, self._bands]
+
+        def light(means: rasters.Means) -> Array:
+            layers = zip(means.values(), scale, offset, strict=True)
+            return quicklook.linear_rgb((values * s + o for values, s, o in layers), matrix[self._bands])
+
+        return light(self._before), light(self._after)
 
     def _thinned(self, block: Block) -> Block:
         """A block among the rows that count."""
@@ -88,7 +91,7 @@ def draw_quicklook(
     results : by product. lights : before and after, if they were gathered.
     """
     wavelengths, matrix = _colours(scene)
-    before, after = _read_lights(scene, matrix, results) if lights is None else lights.images()
+    before, after = _read_lights(scene, matrix, results) if lights is None else lights.images(matrix)
     path = folder / "quicklook.png"
     flag_file = results.get("flags")
     flags = np.zeros(before.shape[:2], np.uint16)
@@ -97,6 +100,11 @@ def draw_quicklook(
     note = quicklook.rendering_note(wavelengths, matrix)
     quicklook.before_after(before, after, flags, path, title=scene.name, note=note)
     return path
+
+
+def _shown(scene: "Scene") -> list[int]:
+    """Bands that the picture of a scene shows."""
+    return quicklook.shown_bands(_good(scene.wavelengths_um, scene.image))
 
 
 def _colours(scene: "Scene") -> tuple[tuple[float, ...], Array]:
