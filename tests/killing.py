@@ -97,6 +97,7 @@ def trial(folder, number, keys, *, step=None, after=None, number_of_signal=signa
     shutil.copytree(folder / "old", out)
     config = place / "city.toml"
     config.write_text((folder / "new.toml").read_text().replace("@OUT@", str(out)))
+    (place / "log").touch()  # a kill may come before the run opens it
 
     def kill(count):
         if count == step:
