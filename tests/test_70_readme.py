@@ -37,6 +37,7 @@ LONG = {
     "tscorr fit --scenes configs/delft.toml -o mine.toml": ("tests/test_40_samples.py", "fit_scenes(planned(delft("),
     "tscorr bench --quick": ("tests/test_30_bench.py", "bench(quick=True"),
     "python tests/benchmarks/kernel.py": ("tests/test_30_bench.py", 'script["main"](["--quick"'),
+    "python tests/benchmarks/against_copy.py": ("tests/test_40_against_copy.py", "against_copy.measure("),
     "python tests/benchmarks/footprint.py": ("tests/test_60_footprint.py", "footprint.main()"),
 }
 """commands that take long; what runs them, or the same with less to do, and how it says so"""
