@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 NEGLIGIBLE_REFLECTANCE = 5e-5
 """threshold for images of floating point, which have no stored step"""
@@ -71,3 +72,9 @@ class Stored:
             return not np.isfinite(self.nodata) or abs(self.nodata) <= float(np.finfo(self.dtype).max)
         limits = np.iinfo(self.dtype)
         return float(self.nodata).is_integer() and limits.min <= self.nodata <= limits.max
+
+    def has_data(self, values: NDArray[Any]) -> NDArray[np.bool_]:
+        """Where all bands of stored values (bands, rows, cols) are numbers and not nodata: (rows, cols)."""
+        floating = self.dtype.kind == "f"
+        found = np.isfinite(values).all(axis=0) if floating else np.ones(values.shape[1:], np.bool_)
+        return found & (values != self.nodata).all(axis=0) if self.has_nodata else found

@@ -1,6 +1,6 @@
 """Blocks as the bytes of tiles: each is encoded where it was computed, so that threads share the work of a codec."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -27,10 +27,14 @@ class Tiles(NamedTuple):
 
     def of(self, used: Array) -> "Tiles":
         """Some of the tiles: bool (tiles,)."""
-        parts = [self.data[start : start + size] for start, size in zip(self.offsets, self.sizes, strict=True)]
-        data = b"".join(part for part, wanted in zip(parts, used, strict=True) if wanted)
         sizes = self.sizes[used]
-        return Tiles(memoryview(data), np.cumsum(sizes) - sizes, sizes)
+        places = zip(self.offsets[used], sizes, strict=True)
+        return Tiles.joined((self.data[start : start + size] for start, size in places), sizes)
+
+    @classmethod
+    def joined(cls, parts: Iterable[Any], sizes: Array) -> "Tiles":
+        """Tiles of these bytes, each as long as `sizes` says."""
+        return cls(memoryview(b"".join(parts)), np.cumsum(sizes) - sizes, sizes)
 
 
 class Encoder:

@@ -53,10 +53,10 @@ class StoredTiles:
         """The tiles of a block; InputError where the file ends before."""
         numbers = self._layout.numbers(block).ravel()
         sizes = self._sizes[numbers]
-        data = b"".join(map(self._read, self._offsets[numbers].tolist(), sizes.tolist()))
-        if len(data) != sizes.sum():
+        tiles = Tiles.joined(map(self._read, self._offsets[numbers].tolist(), sizes.tolist()), sizes)
+        if len(tiles.data) != sizes.sum():
             raise InputError(f"{self._info.path} cannot be read: it ends within a tile of {block}")
-        return Tiles(memoryview(data), np.cumsum(sizes) - sizes, sizes)
+        return tiles
 
     def _read(self, start: int, size: int) -> bytes:
         return os.pread(self._file, size, start)

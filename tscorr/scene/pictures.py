@@ -53,13 +53,11 @@ class Lights:
         thin, cells = self._thinned(block), self._before.cells
         rows = slice(-block.row % self._stride, None, self._stride)
         values = np.stack([image[band, rows] for band in self._bands])
-        missing = ~np.isfinite(values).all(axis=0)
-        if self._stored.has_nodata:
-            missing |= (values == self._stored.nodata).any(axis=0)
-        if not missing.any():
+        valid = self._stored.has_data(values)
+        if valid.all():
             return cells.sums(thin, values), cells.sizes(thin)
-        values[:, missing] = 0
-        return cells.sums(thin, values), cells.sums(thin, ~missing[None])
+        values[:, ~valid] = 0
+        return cells.sums(thin, values), cells.sums(thin, valid[None])
 
     def add(self, block: Block, before: tuple[Array, Array], after: tuple[Array, Array]) -> None:
         """Add a block, as `of_block` saw it before and after the correction."""

@@ -90,15 +90,9 @@ class Skipping:
         if not self.flags_need_image:
             return True
         row, col = divmod(int(needed.argmax()), needed.shape[1])
-        if self._valid(image[:, row : row + 1, col : col + 1]).all():
+        if self._scene.stored.has_data(image[:, row : row + 1, col : col + 1]).all():
             return True
-        return bool(self._valid(image)[needed].any())
-
-    def _valid(self, image: Array) -> Array:
-        valid = np.isfinite(image)
-        if self._scene.stored.has_nodata:
-            valid &= image != self._scene.stored.nodata
-        return np.logical_and.reduce(valid)
+        return bool(self._scene.stored.has_data(image)[needed].any())
 
     def specular_rows(self, classes: rasters.Reader) -> tuple[int, int] | None:
         """First and last + 1 of the rows that have a material with a peak, to whole strips; None without any.
