@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-CHUNK = 128
+CHUNK = 64
 """pixels of a row that are worked on at a time: their scratch arrays stay in the L1 cache"""
 
 ENDLESS = np.float32(math.inf)
