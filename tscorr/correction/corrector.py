@@ -247,8 +247,8 @@ def _vectors(values: Array, precision: str) -> Array:
 
 def looked_up(values: Array, table: bytes) -> Array:
     """The entry of a table of 256 for each value, uint8; in half the time of indexing."""
-    found = np.frombuffer(values.tobytes().translate(table), np.uint8)
-    return found.reshape(values.shape).copy()
+    found = bytearray(np.ascontiguousarray(values)).translate(table)
+    return np.frombuffer(found, np.uint8).reshape(values.shape)
 
 
 def class_rows(classes: Array, rows: Mapping[int, int]) -> Array:

@@ -77,9 +77,10 @@ class ShadowByBrightness:
         where = np.nonzero(unsure)
         if not where[0].size:
             return shadowed
-        cos_i = np.broadcast_to((sun * normal).sum(axis=0), unsure.shape)[where]
-        sun_up = np.broadcast_to(sun[2], unsure.shape)[where]
-        up = np.broadcast_to(normal[2], unsure.shape)[where]
+        sun, normal = (
+            np.stack([np.broadcast_to(part, unsure.shape)[where] for part in vectors]) for vectors in (sun, normal)
+        )
+        cos_i, sun_up, up = (sun * normal).sum(axis=0), sun[2], normal[2]
         row = rows[where]
         plane = np.where(self.horizontal[row], np.maximum(cos_i, 0) / sun_up, 1.0)
         sky_view = np.where(self.horizontal[row], (1 + up) / 2, 1.0)

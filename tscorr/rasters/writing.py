@@ -57,7 +57,7 @@ class Writer:
                 "bigtiff": "if_safer",
                 "sparse_ok": True,
             },
-            np.dtype(layer.dtype),
+            layer,
         )
         try:
             with environment(), rasterio.open(path, "w", **options) as dataset:
@@ -211,25 +211,30 @@ class Layer:
     sparse: bool = False
     """blocks need not be written where all is 0, and tiles of zeros are not stored"""
     tags: Mapping[str, str] = field(default_factory=dict)
+    bits: bool = False
+    """each bit is a matter of its own, so that the difference of two values means nothing"""
     palette: Array | None = None
     """red, green, blue of each value that the type can hold: uint8 (values, 3)"""
 
 
-def _fitting_predictor(options: dict[str, Any], dtype: np.dtype[Any]) -> dict[str, Any]:
-    """Creation options that suit the type: predictor 3 is for floating point, 2 for integers."""
+def _fitting_predictor(options: dict[str, Any], layer: Layer) -> dict[str, Any]:
+    """Creation options that suit the type: predictor 3 is for floating point, 2 for integers, none for bits."""
     options = dict(options)
     compressed = options.get("compress") in {"deflate", "lzw", "zstd"}
-    if not compressed or options.get("predictor", 1) == 1:
+    if not compressed or layer.bits or options.get("predictor", 1) == 1:
         options.pop("predictor", None)
     else:
-        options["predictor"] = 2 if dtype.kind in "iu" else 3
+        options["predictor"] = 2 if np.dtype(layer.dtype).kind in "iu" else 3
     if options.get("compress") == "zstd":
         options["zstd_level"] = ZSTD_LEVEL
     return options
 
 
-def make_cog(path: Path, resampling: Resampling) -> None:
-    """Turn a GeoTIFF into a cloud-optimised one, with overviews of half, a quarter, ... down to one tile."""
+def make_cog(path: Path, *, bits: bool) -> None:
+    """Turn a GeoTIFF into a cloud-optimised one, with overviews of half, a quarter, ... down to one tile.
+
+    bits : as in `Layer`; then an overview has the nearest values, else their means.
+    """
     hidden = path.with_name(f".{path.name}.cog")
     try:
         with rasterio.Env(**ENVIRONMENT, ZSTD_LEVEL_OVERVIEW=ZSTD_LEVEL):
@@ -237,12 +242,13 @@ def make_cog(path: Path, resampling: Resampling) -> None:
                 profile, longest = dataset.profile, max(dataset.shape)
                 side = tile_side(dataset.count * np.dtype(dataset.dtypes[0]).itemsize)  # its bands stand together
                 levels = [2**i for i in range(1, 16) if longest // 2 ** (i - 1) > COG_TILE]
-                dataset.build_overviews(levels, resampling)
+                dataset.build_overviews(levels, Resampling.nearest if bits else Resampling.average)
             options = {"blocksize": side, "overviews": "FORCE_USE_EXISTING" if levels else "NONE"}
             options["compress"] = profile.get("compress", "none")
             if options["compress"] == "zstd":
                 options["level"] = ZSTD_LEVEL
-            options["predictor"] = "YES" if options["compress"] in {"deflate", "lzw", "zstd"} else "NO"
+            compressed = options["compress"] in {"deflate", "lzw", "zstd"}
+            options["predictor"] = "YES" if compressed and not bits else "NO"
             copy_raster(path, hidden, driver="COG", **options)
         hidden.replace(path)
     except RasterioError as error:

@@ -72,7 +72,12 @@ def layer_of(scene: Scene, name: str) -> rasters.Layer:
             tags={**tags, "QUANTITY": "1 sigma of the corrected reflectance factor", "TSCORR_COVARIANCE": origins},
         ),
         "flags": rasters.Layer(
-            names=("flags",), dtype="uint16", tags={**tags, **FLAG_TAGS}, sparse=True, palette=flag_palette()
+            names=("flags",),
+            dtype="uint16",
+            tags={**tags, **FLAG_TAGS},
+            sparse=True,
+            bits=True,
+            palette=flag_palette(),
         ),
         "azimuthal_width": replace(angles, names=("azimuthal width",), units=("degree",)),
         "angles": angles,

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.enums import Resampling
 
 from tscorr import rasters
 from tscorr.angles import angle_between, facet_angles, true_azimuth, zenith_azimuth
@@ -50,6 +49,8 @@ def silent(pixels: int) -> None:
 ANGLE_ROWS = 64
 """rows whose angles are found at once: they are float64 meanwhile"""
 LEAST_CONFIDENCE = 0.5
+OF_EVERY_PIXEL = {"angles", "azimuthal_width"}
+"""products that need directions where no material with a peak is"""
 ANGLES_OF_SUN = {"incidence", "solar_zenith", "solar_azimuth"}
 
 
@@ -113,6 +114,8 @@ class Pipeline:
         self._masks = masks
         self._products = written_products(scene)
         self._as_difference = scene.config.output.corrected == "vrt"
+        self._is_whole = not scene.config.run.skip or bool(self._products & OF_EVERY_PIXEL)
+        """directions are wanted of all pixels, not of those with a lobe only"""
         self._weighted = scene.confidence is not None and scene.config.correction.weigh_by_confidence
         self.corrector = Corrector(
             scene.materials,
@@ -181,7 +184,7 @@ class Pipeline:
         name, writer = product
         writer.close()
         if self.scene.config.output.format == "cog":
-            rasters.make_cog(writer.path, Resampling.nearest if name == "flags" else Resampling.average)
+            rasters.make_cog(writer.path, bits=name == "flags")
 
     def _prepare(self) -> None:
         """Sweep the surface for shadows and hidden ground, where a material with a peak is anywhere."""
@@ -313,9 +316,10 @@ class Pipeline:
         if shade is None and needed.any():
             shade = self.ground.shadowed(block)
         confidence = self._class_confidence(block)
-        view, seconds, unseen = scene.view.look(scene.grid, block, self.ground.surface.heights(block))
+        wanted = None if self._is_whole else needed
+        heights, normal, unreliable = self.ground.surface.relief(block, wanted)
+        view, seconds, unseen = scene.view.look(scene.grid, block, heights, wanted)
         sun = scene.sun.vectors(block, seconds)
-        normal, unreliable = self.ground.surface.normals(block)
         hidden = self.ground.hidden(block, needed) if needed.any() else None
         inputs = BlockInputs(
             image=image,

@@ -39,8 +39,9 @@ class MosaicView(View):
     cameras: Cameras
     read: ReadIds
 
-    def look(self, grid: Grid, block: Block, heights: Array) -> Look:
+    def look(self, grid: Grid, block: Block, heights: Array, wanted: Array | None = None) -> Look:
         """Vectors (3, rows, cols) to the cameras; unseen where a pixel came from none of them."""
+        del wanted
         index = self.cameras.places(self.read(grid, block))
         x, y = ground(grid, block)
         camera = self.cameras.positions[:, index]

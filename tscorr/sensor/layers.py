@@ -23,9 +23,9 @@ class RasterView(View):
 
     read: ReadVectors
 
-    def look(self, grid: Grid, block: Block, heights: Array) -> Look:
+    def look(self, grid: Grid, block: Block, heights: Array, wanted: Array | None = None) -> Look:
         """Vectors (3, rows, cols); unseen where the rasters hold none."""
-        del heights
+        del heights, wanted
         vectors = self.read(grid, block)
         missing = ~np.any(vectors, axis=0)
         if not missing.any():

@@ -52,10 +52,10 @@ class LineView(View):
         """(samples, 6), position and forward vector."""
         return np.ascontiguousarray(self.path.table.T)
 
-    def look(self, grid: Grid, block: Block, heights: Array) -> Look:
+    def look(self, grid: Grid, block: Block, heights: Array, wanted: Array | None = None) -> Look:
         """Vectors (3, rows, cols) from the surface to the sensor as it passed, and when that was."""
         x, y = ground(grid, block)
-        seconds, vectors = self._passes(x, y, heights)
+        seconds, vectors = self._passes(x, y, heights, wanted)
         unseen = np.isnan(seconds)
         if not unseen.any():
             return Look(vectors, seconds)
@@ -67,13 +67,14 @@ class LineView(View):
         points = (np.broadcast_to(values, shape).reshape(1, -1) for values in (x, y, z))
         return self._passes(*points)[0].reshape(shape)
 
-    def _passes(self, x: Array, y: Array, z: Array) -> tuple[Array, Array]:
+    def _passes(self, x: Array, y: Array, z: Array, wanted: Array | None = None) -> tuple[Array, Array]:
         """Times (rows, cols) and vectors (3, rows, cols) of points that broadcast to (rows, cols)."""
-        from tscorr.sensor.compiled import passes
+        from tscorr.sensor.compiled import EVERYWHERE, passes
 
         shape = np.broadcast_shapes(x.shape, y.shape, z.shape)
         points = np.stack([np.broadcast_to(values, shape).astype(np.float64) for values in (x, y, z)])
-        return passes(points, self.path.seconds, self._samples, self._candidates(*points))
+        candidates, wanted = self._candidates(*points), EVERYWHERE if wanted is None else wanted
+        return passes(points, self.path.seconds, self._samples, candidates, wanted)
 
     def _candidates(self, x: Array, y: Array, z: Array) -> Array:
         """Samples k such that the scan plane may go over one of the points between k and k + 1."""

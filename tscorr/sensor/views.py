@@ -39,10 +39,11 @@ not certain that all of a patch was seen.
 class View(Protocol):
     """How a scene was seen."""
 
-    def look(self, grid: Grid, block: Block, heights: Array) -> Look:
+    def look(self, grid: Grid, block: Block, heights: Array, wanted: Array | None = None) -> Look:
         """How a block of a grid was seen.
 
         heights : (rows, cols), or (1, 1) where constant. [m]
+        wanted  : bool (rows, cols), where it matters: what is said of other pixels means nothing. All if None.
         """
 
     def vectors(self, grid: Grid, block: Block, heights: Array) -> Array:
@@ -73,9 +74,9 @@ class ConstantView(View):
     zenith_deg: float
     azimuth_deg: float
 
-    def look(self, grid: Grid, block: Block, heights: Array) -> Look:
+    def look(self, grid: Grid, block: Block, heights: Array, wanted: Array | None = None) -> Look:
         """The vector (3, 1, 1)."""
-        del block, heights
+        del block, heights, wanted
         convergence = convergence_deg(grid, *grid.center) if grid.crs is not None else 0.0
         return Look(unit_vector(self.zenith_deg, grid_azimuth(self.azimuth_deg, convergence)).reshape(3, 1, 1))
 
@@ -98,13 +99,13 @@ class FrameView(View):
 
     position: tuple[float, float, float]
 
-    def look(self, grid: Grid, block: Block, heights: Array) -> Look:
+    def look(self, grid: Grid, block: Block, heights: Array, wanted: Array | None = None) -> Look:
         """Vectors (3, rows, cols) from the surface to the projection centre."""
-        from tscorr.sensor.compiled import towards
+        from tscorr.sensor.compiled import EVERYWHERE, towards
 
         transform, position = np.array(grid.transform[:6]), np.array(self.position)
-        vectors = np.empty((3, *block.shape))
-        towards(position, np.array(heights, np.float64, order="C"), transform, block.row, block.col, vectors)
+        vectors, below = np.empty((3, *block.shape)), np.ascontiguousarray(heights)
+        towards(position, below, transform, block.row, block.col, EVERYWHERE if wanted is None else wanted, vectors)
         return Look(vectors)
 
     def check(self, grid: Grid, highest_m: float) -> None:

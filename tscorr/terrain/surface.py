@@ -4,7 +4,7 @@ import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,24 @@ TILE_PX = 512
 """roof planes are found in tiles of this side, wherever the blocks of a run are cut"""
 
 
+class Relief(NamedTuple):
+    """The surface under a block: `Surface.heights`, and both of `Surface.normals`."""
+
+    heights: Array
+    normals: Array
+    unreliable: Array | None
+
+
 class Surface(Protocol):
     """Heights and normals of blocks of a scene."""
+
+    def relief(self, block: Block, wanted: Array | None = None) -> Relief:
+        """Heights and normals at once.
+
+        wanted : bool (rows, cols), where the normals are wanted: what they are elsewhere means nothing.
+        """
+        del wanted
+        return Relief(self.heights(block), *self.normals(block))
 
     def heights(self, block: Block) -> Array:
         """Heights (rows, cols), or (1, 1) where constant; never nan. [m]"""
@@ -34,7 +50,7 @@ class Surface(Protocol):
         """1 sigma of the normals along each of two axes (rows, cols), or (1, 1) where constant; 0: not known. [deg]"""
 
 
-class FlatSurface:
+class FlatSurface(Surface):
     """A horizontal surface at one height."""
 
     def __init__(self, height_m: float) -> None:
@@ -56,7 +72,7 @@ class FlatSurface:
         return np.zeros((1, 1), np.float32)
 
 
-class DsmSurface:
+class DsmSurface(Surface):
     """The surface of a DSM, with normals by Horn's 3 x 3 weights.
 
     read     : heights of a block, nan where void.
@@ -74,12 +90,17 @@ class DsmSurface:
         """Heights (rows, cols). [m]"""
         return _filled(self._read(block), self._level_m)
 
-    def normals(self, block: Block) -> tuple[Array, Array]:
+    def normals(self, block: Block) -> tuple[Array, Array | None]:
         """Normals of the 3 x 3 windows."""
+        relief = self.relief(block)
+        return relief.normals, relief.unreliable
+
+    def relief(self, block: Block, wanted: Array | None = None) -> Relief:
+        """Heights, and normals of the 3 x 3 windows; they are read once for both."""
         halo = HORN_HALO_PX
-        result = horn_normals(self._read(block.padded(halo)), **self._cell)
-        inner = (slice(halo, -halo), slice(halo, -halo))
-        return result.normals[:, *inner], result.unreliable[inner]
+        around = self._read(block.padded(halo))
+        normals, unreliable = horn_normals(around, halo=halo, wanted=wanted, **self._cell)
+        return Relief(_filled(around[halo:-halo, halo:-halo], self._level_m), normals, unreliable)
 
     def normal_sigma_deg(self, block: Block) -> Array:
         """From the noise of the heights, (rows, cols). [deg]
@@ -92,7 +113,7 @@ class DsmSurface:
         return np.rad2deg(slope * np.sqrt((up**4 + up**2) / 2)).astype(np.float32)
 
 
-class RoofPlaneSurface:
+class RoofPlaneSurface(Surface):
     """The surface of a DSM, with the normals of planes fitted to roof faces.
 
     Planes are found in fixed tiles with a halo, so results do not depend on how a run is cut into blocks.
@@ -162,7 +183,7 @@ class RoofPlaneSurface:
             return planes
 
 
-class GivenNormals:
+class GivenNormals(Surface):
     """Normals from a raster (3, rows, cols), and heights from another or constant."""
 
     def __init__(self, read: Read, surface: Surface) -> None:
