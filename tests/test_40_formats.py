@@ -16,7 +16,7 @@ from tscorr import batch, publish, rasters
 from tscorr.correction import PixelFlag, SpecularState, specular_state
 from tscorr.errors import InputError, OutputError
 from tscorr.grid import Block, blocks
-from tscorr.quicklook import FLAG_COLOURS
+from tscorr.quicklook import FLAG_COLOURS, flag_palette
 from tscorr.scene.styles import flag_style
 
 UTM = "EPSG:32631"
@@ -409,6 +409,7 @@ def test_flags_have_a_colour_table_and_a_legend_of_what_occurs(tmp_path):
         assert table[unknown_value] == colours["no material"]
         assert table[unknown_value | PixelFlag.NODATA] == colours["no data"]
         assert len(table) == 1 << 16
+        assert np.array_equal([table[value][:3] for value in range(1 << 16)], flag_palette())
         entries = ET.parse(folder / "flags.qml").getroot().iter("paletteEntry")
         legend = {int(entry.get("value")): (entry.get("label"), entry.get("color")) for entry in entries}
         assert set(legend) == set(np.unique(flags).tolist())

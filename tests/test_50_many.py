@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from many_scenes import measured, write_scenes
 
-from tscorr import batch, publish
+from tscorr import batch, publish, rasters
 from tscorr.config import load_config
 from tscorr.scene import overlap
 
@@ -69,6 +69,19 @@ def test_what_serves_all_scenes_is_hashed_once(many):
     assert hashed["dsm.tif"] == 1
     assert hashed["class_map.tif"] == 1
     assert hashed["line00_03.tif"] == 1
+
+
+def test_the_header_of_what_serves_all_scenes_is_read_once(many, monkeypatch):
+    described, describe = Counter(), rasters.describe
+
+    def noted(path, **options):
+        described[Path(path).name] += 1
+        return describe(path, **options)
+
+    monkeypatch.setattr(rasters, "describe", noted)
+    batch.plan(load_config(many[0] / "city.toml"))
+    assert described["class_map.tif"] == 1
+    assert described["dsm.tif"] <= 2  # and once more for its heights, where they are not known yet
 
 
 def test_the_largest_overlaps_are_compared_and_no_more_than_is_promised(many):

@@ -20,7 +20,8 @@ from typing import Any, Self
 from tscorr.errors import InputError, OutputError
 
 MANIFEST = "manifest.json"
-SEAL = "manifest_sha256"
+SEALED = ',\n "manifest_sha256": "'
+"""stands before the hash that ends a manifest"""
 HASHING_THREADS = 2
 READ_BYTES = 1 << 20
 HIDDEN = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>part|old)")
@@ -109,7 +110,7 @@ class Publication:
                 path.name: {"sha256": self._hashes[path].result(), "bytes": path.stat().st_size} for path in files
             }
             path = self.folder / MANIFEST
-            path.write_text(_sealed({**manifest, "outputs": outputs}), encoding="utf-8")
+            path.write_text(_sealed(json.dumps({**manifest, "outputs": outputs}, indent=1)), encoding="utf-8")
             for file in (*files, path):
                 _flush(file)
             _flush(self.folder)
@@ -218,7 +219,7 @@ def read_manifest(target: Path) -> dict[str, Any] | None:
         manifest = json.loads(text)
     except (OSError, ValueError):
         return None
-    return manifest if isinstance(manifest, dict) and text == _sealed(manifest) else None
+    return manifest if isinstance(manifest, dict) and text == _sealed(text.rpartition(SEALED)[0] + "\n}") else None
 
 
 def damaged(target: Path) -> list[str]:
@@ -244,11 +245,10 @@ def published(folder: Path) -> list[Path]:
     return sorted(path for path in found if not any(map(UNFINISHED.fullmatch, path.relative_to(folder).parts)))
 
 
-def _sealed(manifest: Mapping[str, Any]) -> str:
-    """The text of a manifest, which ends in a hash of all that stands before."""
-    content = {name: value for name, value in manifest.items() if name != SEAL}
-    digest = hashlib.sha256(json.dumps(content, indent=1).encode()).hexdigest()
-    return json.dumps({**content, SEAL: digest}, indent=1) + "\n"
+def _sealed(content: str) -> str:
+    """The text of a manifest, which ends in a hash of its content as a JSON object, indented by one."""
+    digest = hashlib.sha256(content.encode()).hexdigest()
+    return f'{content[:-2]}{SEALED}{digest}"\n}}\n'
 
 
 def _flush(path: Path) -> None:

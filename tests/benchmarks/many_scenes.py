@@ -2,8 +2,9 @@
 
 Scenes of 512 x 512 pixels lie in flight lines that overlap by a quarter, over one surface model and one class map.
 Times are of the processor, so that other programs do not lengthen them. Work is reading, geometry,
-kernel and writing; report is the scene's page and picture; overhead is the rest of the batch: planning, files opened
-and described, manifests, the pages of the batch. The last column is the wall time of one worker over that of two.
+kernel, writing and hashing; report is the scene's page and picture; overhead is the rest of the batch: planning, files
+opened and described, manifests, overlaps, the pages of the batch. The last column is the wall time of one worker over
+that of two.
 """
 
 import resource
@@ -21,12 +22,21 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from small_scene import CELL, NORTH, SCALE, SCENE, WEST, write_config, write_raster
 
-from tscorr import batch
-from tscorr.scene import correct
-from tscorr.scene.run import Sums, silent
+from tscorr import batch, publish
+from tscorr.scene import correct, pictures
+from tscorr.scene.run import Pipeline, Sums, silent
 
 SIDE, STEP, ACROSS = 512, 384, 20
 """pixels of a scene, from one scene to the next, and scenes in a line"""
+COUNTED = (
+    (correct, "summary", "report_s"),
+    (correct, "page", "report_s"),
+    (correct, "draw_quicklook", "report_s"),
+    (pictures, "_light", "report_s"),  # in threads of its own
+    (publish, "sha256", "work_s"),
+    (Pipeline, "_close", "work_s"),  # reads what was written, in threads of its own
+)
+"""functions whose time is no overhead, and what it counts as"""
 
 
 def write_scenes(folder, number, *, side=SIDE, products=None, quicklook=True):
@@ -59,7 +69,8 @@ class Footprint:
 
     def __init__(self):
         self.rss_mb, self.files, self.threads, self.yardstick = [], [], [], []
-        self.report_s = 0.0
+        self.report_s = self.work_s = 0.0
+        self._lock = threading.Lock()
 
     def __call__(self, scene):
         """The `progress` of a batch."""
@@ -78,17 +89,18 @@ class Footprint:
         """How much longer the same computation took on average than at best: what other programs cost this one."""
         return float(np.mean(self.yardstick) / np.min(self.yardstick))
 
-    def counting(self, draw):
-        """A function whose processor time is that of the reports."""
+    def counting(self, function, total):
+        """The same function, whose processor time is added to `report_s` or `work_s`; any thread may call it."""
 
-        def drawn(*args, **kwargs):
+        def counted(*args, **kwargs):
             start = time.thread_time()
             try:
-                return draw(*args, **kwargs)
+                return function(*args, **kwargs)
             finally:
-                self.report_s += time.thread_time() - start
+                with self._lock:
+                    setattr(self, total, getattr(self, total) + time.thread_time() - start)
 
-        return drawn
+        return counted
 
     def growth_mb(self, warm_up):
         """Memory that a scene adds, as the slope over all scenes after the first ones. [MB]"""
@@ -111,14 +123,14 @@ def measured(config, **options):
     footprint = Footprint()
     with ExitStack() as patches:
         patches.enter_context(mock.patch.object(Sums, "timed", processor_time))
-        for name in ("summary", "page", "draw_quicklook"):
-            draw = footprint.counting(getattr(correct, name))
-            patches.enter_context(mock.patch.object(correct, name, draw))
+        for module, name, total in COUNTED:
+            counted = footprint.counting(getattr(module, name), total)
+            patches.enter_context(mock.patch.object(module, name, counted))
         start = time.process_time()
         result = batch.run(config, progress=footprint, **options)
         total = time.process_time() - start
     stages = "read", "geometry", "kernel", "write"
-    work = sum(scene.report["seconds"][stage] for scene in result.scenes for stage in stages)
+    work = footprint.work_s + sum(scene.report["seconds"][stage] for scene in result.scenes for stage in stages)
     a_scene = 1e3 / len(result.scenes) / footprint.slowness
     return result, footprint, a_scene * work, a_scene * (total - work - footprint.report_s)
 

@@ -1,8 +1,9 @@
 """All scenes checked before work on any of them starts."""
 
 from collections.abc import Sequence
+from functools import cache
 
-from tscorr import config
+from tscorr import config, rasters
 from tscorr.batch.preflight import preflight
 from tscorr.errors import ConfigError, InputError, TscorrError, nearest
 from tscorr.materials import Material, builtin_materials, find, load_materials
@@ -49,11 +50,12 @@ def plan(
             problems.append(error)
             library[name] = library["lambertian"]  # so that the scenes can be checked all the same
     planned = []
+    describe = cache(rasters.describe)  # class maps and surface models serve many scenes
     for scene in settings.scenes:
         if scenes and scene.name not in scenes:
             continue
         try:
-            planned.append(plan_scene(scene, settings, library, materials))
+            planned.append(plan_scene(scene, settings, library, materials, describe))
         except TscorrError as error:
             problems += [type(error)(f"scene '{scene.name}': {line}") for line in str(error).splitlines()]
     if to_run:

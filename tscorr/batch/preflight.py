@@ -7,6 +7,8 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from tscorr import config, publish
 from tscorr.errors import ConfigError, OutputError, TscorrError
 from tscorr.scene.correct import is_current, target_of
@@ -82,7 +84,7 @@ def _writable(folder: Path) -> Path:
 def _disk(todo: Sequence[Scene], folder: Path) -> Iterator[TscorrError]:
     """The results must fit on the disk, each beside the one that it replaces until that is deleted."""
     free = shutil.disk_usage(folder).free
-    least, most = (_peak(todo, which) for which in (0, 1))
+    least, most = _peaks(todo)
     if least > free:
         yield OutputError(
             f"the results need {least / 1e6:.1f} MB on the disk of {folder}, or {most / 1e6:.1f} MB where they do not "
@@ -94,12 +96,12 @@ def _disk(todo: Sequence[Scene], folder: Path) -> Iterator[TscorrError]:
         )
 
 
-def _peak(todo: Sequence[Scene], which: int) -> float:
-    """Most bytes in use above those of now, while the scenes are written one after the other."""
-    used = peak = 0.0
+def _peaks(todo: Sequence[Scene]) -> tuple[float, float]:
+    """Bytes in use above those of now while the scenes are written one after the other, at the worst: least, most."""
+    used = peak = np.zeros(2)
     for scene in todo:
-        used += disk_bytes(scene)[which]
-        peak = max(peak, used)
+        used = used + disk_bytes(scene)
+        peak = np.maximum(peak, used)
         old = publish.read_manifest(target_of(scene))
-        used -= 0 if old is None else sum(entry["bytes"] for entry in old["outputs"].values())
-    return peak
+        used = used - (0 if old is None else sum(entry["bytes"] for entry in old["outputs"].values()))
+    return float(peak[0]), float(peak[1])

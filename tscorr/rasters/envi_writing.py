@@ -80,27 +80,30 @@ class EnviWriter:
         """Close without a check; what was written will be deleted."""
         os.close(self._file)
 
-    def close(self) -> None:
-        """Close, and raise OutputError unless every block reads back as it was written."""
+    def close(self) -> RasterInfo:
+        """Close; what the header says. Raises OutputError unless every block reads back as it was written."""
         try:
             whole = all(checksum(self._read(block)) == expected for block, expected in self._written.items())
         finally:
             os.close(self._file)
-        if not (whole and self._is_read_again()):
+        info = self._read_again() if whole else None
+        if info is None:
             raise OutputError(f"{self.path} does not read back as written; is the disk full?")
+        return info
 
     def _read(self, block: Block) -> bytes:
         return b"".join(read_at(self._file, stretch) for stretch in self._stretches(block))
 
-    def _is_read_again(self) -> bool:
-        """Whether the header is whole too: a block comes out of the file by it as it went in."""
+    def _read_again(self) -> RasterInfo | None:
+        """The header, which is whole too if a block comes out of the file as it went in; None where it does not."""
         block, expected = next(iter(self._written.items()))
         try:
-            with Reader(describe(self.path)) as reader:
+            info = describe(self.path, ours=True)
+            with Reader(info) as reader:
                 ordered = np.ascontiguousarray(np.transpose(reader.read(block), self._axes), dtype=self._dtype)
         except InputError:
-            return False
-        return checksum(ordered.reshape(-1).view(np.uint8)) == expected
+            return None
+        return info if checksum(ordered.reshape(-1).view(np.uint8)) == expected else None
 
     def _in_order(self, of_bands_rows_cols: tuple[Any, Any, Any]) -> tuple[Any, ...]:
         return tuple(of_bands_rows_cols[axis] for axis in self._axes)

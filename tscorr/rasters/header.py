@@ -123,31 +123,36 @@ def describe(path: str | Path, *, ours: bool = False, draws_on: Sequence[Path] =
         raise InputError(f"{path} is no file; allowed is a raster")
     with opened(path, ours=ours) as dataset:
         check_sound(dataset, path, draws_on)
-        dtype = np.dtype(dataset.dtypes[0])
-        rows, cols = dataset.block_shapes[0]
-        fields = dataset.tags(ns="ENVI") if dataset.driver == "ENVI" else {}
-        wavelengths, widths = _wavelengths(dataset, fields)
-        return RasterInfo(
-            path=path,
-            grid=Grid(dataset.crs, dataset.transform, dataset.shape),
-            bands=dataset.count,
-            dtype=dtype,
-            nodata=dataset.nodata if can_hold(dtype, dataset.nodata) else None,
-            scales=_scales(dataset, fields),
-            offsets=tuple(dataset.offsets),
-            names=_names(dataset, fields),
-            wavelengths_um=wavelengths,
-            fwhm_um=widths,
-            tile=(rows, cols),
-            profile=_profile(dataset),
-            tags=dataset.tags(),
-            band_tags=_band_tags(dataset, wavelengths if fields else None, widths if fields else None),
-            colors=tuple(dataset.colorinterp),
-            bad_bands=envi.bad_bands(fields, dataset.count),
-            envi=fields,
-            files=(path, *(Path(file) for file in dataset.files[1:])),
-            ours=ours,
-        )
+        return info_of(dataset, path, ours=ours)
+
+
+def info_of(dataset: Any, path: Path, *, ours: bool) -> RasterInfo:
+    """What the header of an open dataset says; see `describe`."""
+    dtype = np.dtype(dataset.dtypes[0])
+    rows, cols = dataset.block_shapes[0]
+    fields = dataset.tags(ns="ENVI") if dataset.driver == "ENVI" else {}
+    wavelengths, widths = _wavelengths(dataset, fields)
+    return RasterInfo(
+        path=path,
+        grid=Grid(dataset.crs, dataset.transform, dataset.shape),
+        bands=dataset.count,
+        dtype=dtype,
+        nodata=dataset.nodata if can_hold(dtype, dataset.nodata) else None,
+        scales=_scales(dataset, fields),
+        offsets=tuple(dataset.offsets),
+        names=_names(dataset, fields),
+        wavelengths_um=wavelengths,
+        fwhm_um=widths,
+        tile=(rows, cols),
+        profile=_profile(dataset),
+        tags=dataset.tags(),
+        band_tags=_band_tags(dataset, wavelengths if fields else None, widths if fields else None),
+        colors=tuple(dataset.colorinterp),
+        bad_bands=envi.bad_bands(fields, dataset.count),
+        envi=fields,
+        files=(path, *(Path(file) for file in dataset.files[1:])),
+        ours=ours,
+    )
 
 
 def can_hold(dtype: np.dtype[Any], value: float | None) -> bool:

@@ -1,6 +1,7 @@
 """Where a TIFF keeps its tiles or strips: what lets whole ones be written, and moved, as bytes.
 
-TIFF 6.0 and BigTIFF. All tags are GDAL's work; only the two lists of places and sizes are changed here.
+TIFF 6.0 and BigTIFF. All tags are GDAL's work; only what the two lists of places and sizes and a palette hold is
+changed here.
 """
 
 import struct
@@ -33,7 +34,10 @@ CODING = {
     339: "kind of number",
 }
 """tags that decide what values the bytes of a tile stand for"""
+PALETTE = 320
 MOST_SAMPLES = 1 << 16
+MOST_NUMBERS = dict.fromkeys(CODING, MOST_SAMPLES) | {PALETTE: 3 << 16}
+"""in the tags that do not have one for each tile"""
 MEANING, PLAIN = 262, {0, 1, 2, 3}
 """that of the samples; some that change no value: grey, white to black, colours, a palette"""
 WORDS = {3: "u2", 4: "u4", 16: "u8"}
@@ -60,6 +64,8 @@ class Directory(NamedTuple):
     sizes: Words
     coding: dict[int, Words]
     """the tags of CODING that it has"""
+    palette: Words | None
+    """red of all values, green of all, blue of all; 65535 is full light"""
 
     def coded(self, read: Read) -> tuple[str, dict[int, set[int]]]:
         """How bytes become values, equal for equal codings: their order, and the numbers of each tag of CODING.
@@ -139,17 +145,19 @@ def directory(read: Read, tiles: int | None = None) -> Directory:
         for _ in range(entries):
             tag, kind, count = _numbers(read, place, order + entry_type)
             place += struct.calcsize(order + entry_type)
-            if tag in (*OFFSETS, *SIZES, *CODING):
+            if tag in (*OFFSETS, *SIZES, *MOST_NUMBERS):
                 dtype = np.dtype(WORDS[kind]).newbyteorder(order)
                 fits = count * dtype.itemsize <= room
                 start = place if fits else _numbers(read, place, order + ("Q" if big else "I"))[0]
-                sane = count <= MOST_SAMPLES if tag in CODING else tiles in {None, count}
+                sane = count <= MOST_NUMBERS[tag] if tag in MOST_NUMBERS else tiles in {None, count}
                 if not sane:
                     raise ValueError(f"no whole TIFF: {count} numbers in tag {tag}")
                 found[tag] = Words(start, dtype, count)
             place += room
         strips_or_tiles = 0 if OFFSETS[0] in found else 1
-        return Directory(found.pop(OFFSETS[strips_or_tiles]), found.pop(SIZES[strips_or_tiles]), found)
+        offsets, sizes = found.pop(OFFSETS[strips_or_tiles]), found.pop(SIZES[strips_or_tiles])
+        palette = found.pop(PALETTE, None)
+        return Directory(offsets, sizes, found, palette)
     except (KeyError, OverflowError, struct.error) as error:
         raise ValueError(f"no whole TIFF: {error}") from None
 

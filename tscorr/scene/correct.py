@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -93,10 +94,10 @@ def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
         publish.Publication(target_of(scene), threads_of(scene)) as publication,
     ):
         pipeline = Pipeline(scene, publication.folder)
-        sums, lights = pipeline.run(progress), pipeline.lights
+        sums, lights, written = pipeline.run(progress), pipeline.lights, pipeline.written
         del pipeline  # and the heights that it keeps
         give_back()
-        return finish(scene, publication, hashes, sums, time.perf_counter() - started, lights)
+        return finish(scene, publication, hashes, sums, time.perf_counter() - started, lights, written)
 
 
 def finish(
@@ -106,10 +107,12 @@ def finish(
     sums: Sums,
     wall_s: float,
     lights: Lights | None = None,
+    written: Mapping[str, rasters.RasterInfo] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Write what stands beside the rasters of a scene, and publish; the content of its report.json.
 
-    hashes : of the scene's inputs. lights : of before and after, if they were gathered.
+    hashes  : of the scene's inputs. lights : of before and after, if they were gathered.
+    written : rasters by product whose headers need not be read.
     """
     folder = publication.folder
     publication.hash_early(sorted(folder.iterdir()))
@@ -118,7 +121,7 @@ def finish(
     if "flags" in scene.config.output.products:
         style = flag_style(np.flatnonzero(sums.flags).tolist())
         (folder / "flags.qml").write_text(style, encoding="utf-8")
-    results = _results(scene, folder)
+    results = _results(scene, folder, written)
     corrected = results.get("corrected")
     if corrected is not None and (residual := residual_glare(scene, corrected)) is not None:
         report["residual_glare"] = residual
@@ -248,10 +251,10 @@ def stac_item(
     )
 
 
-def _results(scene: Scene, folder: Path) -> dict[str, rasters.RasterInfo]:
-    """The rasters written, by product."""
-    products = {*scene.config.output.products, *written_products(scene)}
-    found = {product: rasters.result(folder, product, scene.image) for product in sorted(products)}
+def _results(scene: Scene, folder: Path, written: Mapping[str, rasters.RasterInfo]) -> dict[str, rasters.RasterInfo]:
+    """The rasters in a folder of results, by product; those `written` as they are."""
+    products = sorted({*scene.config.output.products, *written_products(scene)})
+    found = {product: written.get(product) or rasters.result(folder, product, scene.image) for product in products}
     return {product: info for product, info in found.items() if info is not None}
 
 

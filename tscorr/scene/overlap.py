@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ def overlaps(results: Sequence[tuple[Scene, Path]]) -> list[Overlap]:
     Scenes of other bands, or whose results lack the image or the flags, are not compared.
     """
     scenes = {folder: scene for scene, folder in results}
-    is_whole = cache(lambda folder: _layers(scenes[folder], folder) is not None)
+    result = cache(lambda folder: _result(scenes[folder], folder))  # a scene meets several others
     shared = [
         (region, one, two)
         for one, two in _neighbours(results)
@@ -47,8 +47,23 @@ def overlaps(results: Sequence[tuple[Scene, Path]]) -> list[Overlap]:
         and (region := common_region(one[0].grid, two[0].grid)) is not None
     ]
     shared.sort(key=lambda pair: -pair[0].height * pair[0].width)
-    compared = ((region, one, two) for region, one, two in shared if is_whole(one[1]) and is_whole(two[1]))
-    return [difference(one, two, region) for region, one, two in islice(compared, MOST_PAIRS)]
+    pairs = ((result(one[1]), result(two[1]), region) for region, one, two in shared)
+    whole = ((one, two, region) for one, two, region in pairs if one is not None and two is not None)
+    return [difference(one, two, region) for one, two, region in islice(whole, MOST_PAIRS)]
+
+
+class Result(NamedTuple):
+    """A scene, and the rasters of its result that are compared."""
+
+    scene: Scene
+    corrected: rasters.RasterInfo
+    flags: rasters.RasterInfo
+
+
+def _result(scene: Scene, folder: Path) -> Result | None:
+    """The result of a scene, or None where it lacks the image or the flags."""
+    corrected, flags = (rasters.result(folder, product, scene.image) for product in ("corrected", "flags"))
+    return None if corrected is None or flags is None else Result(scene, corrected, flags)
 
 
 def _neighbours(results: Sequence[tuple[Scene, Path]]) -> Iterator[tuple[tuple[Scene, Path], tuple[Scene, Path]]]:
@@ -70,11 +85,6 @@ def _box(grid: Grid, common: Grid) -> tuple[float, float, float, float]:
         return (np.nan,) * 4
     wide, high = 0.05 * np.ptp(x), 0.05 * np.ptp(y)  # sides bend between CRSs
     return float(x.min() - wide), float(y.min() - high), float(x.max() + wide), float(y.max() + high)
-
-
-def _layers(scene: Scene, folder: Path) -> tuple[rasters.RasterInfo, rasters.RasterInfo] | None:
-    corrected, flags = (rasters.result(folder, product, scene.image) for product in ("corrected", "flags"))
-    return None if corrected is None or flags is None else (corrected, flags)
 
 
 def common_region(grid: Grid, other: Grid) -> Block | None:
@@ -99,17 +109,17 @@ def windows(region: Block) -> Iterator[Block]:
             yield Block(region.row + row, region.col + col, height, width)
 
 
-def difference(one: tuple[Scene, Path], two: tuple[Scene, Path], region: Block) -> Overlap:
+def difference(one: Result, two: Result, region: Block) -> Overlap:
     """The differences of two scenes in a region of the first one's grid, material by material as it knows them.
 
     Over pixels assessed in both and corrected in at least one, neither saturated nor beyond correction.
     """
-    first = one[0]
+    first = one.scene
     size = len(first.materials) + 1
     count, before, after = np.zeros(size, np.int64), np.zeros(size), np.zeros(size)
     with ExitStack() as files:
         classes = files.enter_context(first.classes())
-        seen = [_Seen(scene, folder, first.grid, files) for scene, folder in (one, two)]
+        seen = [_Seen(result, first.grid, files) for result in (one, two)]
         for window in windows(region):
             rows = class_rows(classes.read(window, 1), first.rows)
             flags = [scene.flags(window) for scene in seen]
@@ -122,7 +132,7 @@ def difference(one: tuple[Scene, Path], two: tuple[Scene, Path], region: Block) 
             after += np.bincount(mine, _squares(seen, "corrected", window, use), size)
     return Overlap(
         first.name,
-        two[0].name,
+        two.scene.name,
         {
             material.name: Difference(
                 int(count[row]), float(np.sqrt(before[row] / count[row])), float(np.sqrt(after[row] / count[row]))
@@ -154,16 +164,13 @@ def comparable(one: Array, two: Array) -> Array:
 class _Seen:
     """The layers of one scene, laid over a grid."""
 
-    def __init__(self, scene: Scene, folder: Path, grid: Grid, files: ExitStack) -> None:
-        layers = _layers(scene, folder)
-        if layers is None:
-            raise InputError(f"{folder} holds no corrected image and flags to compare")
-        corrected, flags = layers
+    def __init__(self, result: Result, grid: Grid, files: ExitStack) -> None:
+        scene = result.scene
         self._layers = {
             "image": files.enter_context(rasters.Reader(scene.image, grid)),
-            "corrected": files.enter_context(rasters.Reader(corrected, grid)),
+            "corrected": files.enter_context(rasters.Reader(result.corrected, grid)),
         }
-        self._flags = files.enter_context(rasters.Reader(flags, grid, fill=UNKNOWN))
+        self._flags = files.enter_context(rasters.Reader(result.flags, grid, fill=UNKNOWN))
         self._good = scene.good_bands
         self._scale, self._offset = (
             np.array(values)[self._good, None, None] for values in (scene.stored.scale, scene.stored.offset)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -115,15 +116,17 @@ def _read_lights(scene: "Scene", matrix: Array, results: Mapping[str, rasters.Ra
     """Before and after, from the files."""
     from tscorr.scene.cutting import threads_of
 
+    with ThreadPoolExecutor(threads_of(scene)) as readers:  # to decode them is most of the work
+        images = scene.image, results.get("corrected", scene.image)
+        before, after = readers.map(partial(_light, scene, matrix), images)
+    return before, after
+
+
+def _light(scene: "Scene", matrix: Array, info: rasters.RasterInfo) -> Array:
+    """One image of a scene, made small, in linear light (rows, cols, 3)."""
     used = quicklook.used_bands(matrix)
     scale, offset = scene.stored.scale, scene.stored.offset
-
-    def light(info: rasters.RasterInfo) -> Array:
-        return quicklook.linear_rgb(_reflectance(info, used, scale, offset, PICTURE_PX), matrix[used])
-
-    with ThreadPoolExecutor(threads_of(scene)) as readers:  # to decode them is most of the work
-        before, after = readers.map(light, (scene.image, results.get("corrected", scene.image)))
-    return before, after
+    return quicklook.linear_rgb(_reflectance(info, used, scale, offset, PICTURE_PX), matrix[used])
 
 
 def draw_image(

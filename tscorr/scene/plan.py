@@ -23,6 +23,9 @@ Array = NDArray[Any]
 P = ParamSpec("P")
 T = TypeVar("T")
 
+Describe = Callable[[str | Path], rasters.RasterInfo]
+"""the header of a raster: `rasters.describe`, or one that describes once what the scenes of a batch share"""
+
 HEIGHT_WINDOWS, HEIGHT_WINDOW_PX = 6, 256
 """the coarse look at a large surface model: windows a side, and their side"""
 TALLY_PIXELS = 4e6
@@ -132,23 +135,28 @@ class Scene:
 
 
 def plan_scene(
-    settings: config.Scene, whole: config.Config, library: dict[str, Material], only: Sequence[str] = ()
+    settings: config.Scene,
+    whole: config.Config,
+    library: dict[str, Material],
+    only: Sequence[str] = (),
+    describe: Describe = rasters.describe,
 ) -> Scene:
     """Check every input of a scene and compute what does not depend on pixels.
 
-    library : materials by name.
-    only    : if given, the materials to correct; the others are treated as not enabled.
+    library  : materials by name.
+    only     : if given, the materials to correct; the others are treated as not enabled.
+    describe : of class map, confidence and surface.
     Raises ConfigError, MaterialError or InputError with all that is wrong, one thing a line.
     """
     image = _image(settings)
     checks = Checks()
-    class_map = checks(_class_map, settings, whole, image)
-    confidence = checks(_confidence, settings, image)
+    class_map = checks(_class_map, settings, whole, image, describe)
+    confidence = checks(_confidence, settings, image, describe)
     checks(_check_truth, settings.truth, image)
     stored = checks(_stored, settings, whole.correction, image)
     wavelengths = checks(_wavelengths, settings, image)
     seen = checks(view_of, settings.view, image)
-    surface_files = checks(_surface_files, settings.surface, image)
+    surface_files = checks(_surface_files, settings.surface, image, describe)
     checks.settle()
     checks(_check_difference, whole, image, stored)
     names = list(dict.fromkeys(whole.materials.classes.values()))
@@ -228,11 +236,11 @@ def _image(settings: config.Scene) -> rasters.RasterInfo:
     return image
 
 
-def _confidence(settings: config.Scene, image: rasters.RasterInfo) -> rasters.RasterInfo | None:
+def _confidence(settings: config.Scene, image: rasters.RasterInfo, describe: Describe) -> rasters.RasterInfo | None:
     """The raster of class confidence, if there is one; a coarse look tells per cent from shares."""
     if settings.class_confidence is None:
         return None
-    confidence = _single_band(settings.class_confidence, image, "the class confidence")
+    confidence = _single_band(settings.class_confidence, image, describe, "the class confidence")
     shares = rasters.read_decimated(confidence, 256) * confidence.scales[0] + confidence.offsets[0]
     shares = shares[np.isfinite(shares)]
     if shares.size and not (shares.min() >= 0 and shares.max() <= 1 + 1e-6):
@@ -243,8 +251,10 @@ def _confidence(settings: config.Scene, image: rasters.RasterInfo) -> rasters.Ra
     return confidence
 
 
-def _class_map(settings: config.Scene, whole: config.Config, image: rasters.RasterInfo) -> rasters.RasterInfo:
-    class_map = _single_band(settings.class_map, image, "the class map")
+def _class_map(
+    settings: config.Scene, whole: config.Config, image: rasters.RasterInfo, describe: Describe
+) -> rasters.RasterInfo:
+    class_map = _single_band(settings.class_map, image, describe, "the class map")
     if class_map.dtype.kind not in "iu":
         raise InputError(f"the class map {class_map.path} holds {class_map.dtype} values; allowed are integers")
     limits = np.iinfo(class_map.dtype)
@@ -262,9 +272,9 @@ def _class_map(settings: config.Scene, whole: config.Config, image: rasters.Rast
     return class_map
 
 
-def _single_band(path: str, image: rasters.RasterInfo, what: str) -> rasters.RasterInfo:
+def _single_band(path: str, image: rasters.RasterInfo, describe: Describe, what: str) -> rasters.RasterInfo:
     """A raster of one band that shares ground with the image."""
-    raster = rasters.describe(path)
+    raster = describe(path)
     if raster.bands != 1:
         raise InputError(f"{what} {raster.path} has {raster.bands} bands; allowed is one")
     if raster.grid != image.grid:
@@ -399,17 +409,17 @@ def rules_of(
     )
 
 
-def _surface_files(settings: Any, image: rasters.RasterInfo) -> tuple[rasters.RasterInfo, ...]:
+def _surface_files(settings: Any, image: rasters.RasterInfo, describe: Describe) -> tuple[rasters.RasterInfo, ...]:
     """The rasters of a surface, checked: heights first if there are any."""
-    return tuple(_each_surface_file(settings, image))
+    return tuple(_each_surface_file(settings, image, describe))
 
 
-def _each_surface_file(settings: Any, image: rasters.RasterInfo) -> Iterator[rasters.RasterInfo]:
+def _each_surface_file(settings: Any, image: rasters.RasterInfo, describe: Describe) -> Iterator[rasters.RasterInfo]:
     if isinstance(settings, config.FlatSettings):
         return
     heights = settings.path if isinstance(settings, config.DsmSettings) else settings.heights
     if heights is not None:
-        dsm = rasters.describe(heights)
+        dsm = describe(heights)
         if dsm.bands != 1:
             raise InputError(f"the surface model {dsm.path} has {dsm.bands} bands; allowed is one")
         rasters.check_metric(dsm, "the surface model")
@@ -421,7 +431,7 @@ def _each_surface_file(settings: Any, image: rasters.RasterInfo) -> Iterator[ras
     if isinstance(settings, config.ObsSurfaceSettings):
         yield obs_file(settings.path, image, with_slope=True)
     if isinstance(settings, config.NormalsSettings):
-        normals = rasters.describe(settings.path)
+        normals = describe(settings.path)
         if normals.bands != 3:
             raise InputError(f"the normals {normals.path} have {normals.bands} bands; allowed are east, north, up")
         rasters.check_overlap(normals, image, "the normals")

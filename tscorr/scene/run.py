@@ -86,8 +86,8 @@ class Sums:
 
     def flag_counts(self) -> dict[str, int]:
         """Pixels with each flag, by name."""
-        values = np.arange(1 << 16)
-        return {str(flag.name): int(self.flags[(values & flag) != 0].sum()) for flag in SINGLE_FLAGS}
+        found = np.flatnonzero(self.flags)
+        return {str(flag.name): int(self.flags[found[found & flag != 0]].sum()) for flag in SINGLE_FLAGS}
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
@@ -130,6 +130,8 @@ class Pipeline:
         self.sums = Sums(len(scene.materials), scene.image.bands)
         self.lights = Lights.of(scene) if strip is None else None
         """before and after, gathered for the picture"""
+        self.written: dict[str, rasters.RasterInfo] = {}
+        """the rasters by product, once they are whole"""
         self._skipping = Skipping(scene, self.corrector.peaks)
         self._north = north_of(scene.grid)
         self._tables = [
@@ -163,7 +165,7 @@ class Pipeline:
                     writer.abandon()
                 raise
             with self.sums.timed("write"), ThreadPoolExecutor(threads_of(scene)) as pool:
-                list(pool.map(self._close, self.writers.items()))
+                self.written = dict(zip(self.writers, pool.map(self._close, self.writers.values()), strict=True))
             if self._as_difference and self._strip is None:
                 write_corrected_vrt(scene, self.folder)
         return self.sums
@@ -179,12 +181,13 @@ class Pipeline:
             return None
         return tiles if writer.copies(tiles) else None
 
-    def _close(self, product: tuple[str, rasters.Writer | rasters.EnviWriter]) -> None:
+    def _close(self, writer: rasters.Writer | rasters.EnviWriter) -> rasters.RasterInfo:
         """Close and check one raster; make it what was asked for."""
-        name, writer = product
-        writer.close()
-        if self.scene.config.output.format == "cog":
-            rasters.make_cog(writer.path, bits=name == "flags")
+        info = writer.close()
+        if self.scene.config.output.format != "cog":
+            return info
+        rasters.make_cog(writer.path, bits=writer is self.writers.get("flags"))
+        return rasters.describe(writer.path, ours=True)
 
     def _prepare(self) -> None:
         """Sweep the surface for shadows and hidden ground, where a material with a peak is anywhere."""

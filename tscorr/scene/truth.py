@@ -65,9 +65,11 @@ def coverage(scene: Scene, folder: Path) -> dict[str, Any] | None:
     lie within 1 sigma, 95 % within 2.
     """
     truth = scene.settings.truth
+    if truth is None:
+        return None
     names = ("corrected", "flags", "uncertainty")
     known = [file for name in names if (file := rasters.result(folder, name, scene.image)) is not None]
-    if truth is None or len(known) < len(names):
+    if len(known) < len(names):
         return None
     scale, offset = (np.array(values)[:, None, None] for values in (scene.stored.scale, scene.stored.offset))
     counts, within, total = np.zeros(EDGES.size - 1, np.int64), np.zeros(2, np.int64), 0
