@@ -303,7 +303,7 @@ class Pipeline:
             material=rows,
             sun=up,
             view=up,
-            normal=up,
+            normal=up.astype(np.float32),  # as normals of surfaces are: nothing more is compiled
             low_confidence=_doubtful(self._class_confidence(block)),
         )
 

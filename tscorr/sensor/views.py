@@ -89,6 +89,7 @@ class ConstantView(View):
         return lambda x, y, _: (np.broadcast_to(vector, (3, *x.shape)), np.zeros(y.shape[1:]))
 
 
+LEVEL = np.zeros((1, 1), np.float32)
 FARTHEST_OF_HEIGHT = 20
 """a camera farther away than this times its height, 87 degrees from the zenith, has another CRS than said"""
 
@@ -104,8 +105,11 @@ class FrameView(View):
         from tscorr.sensor.compiled import EVERYWHERE, towards
 
         transform, position = np.array(grid.transform[:6]), np.array(self.position)
-        vectors, below = np.empty((3, *block.shape)), np.ascontiguousarray(heights)
-        towards(position, below, transform, block.row, block.col, EVERYWHERE if wanted is None else wanted, vectors)
+        vectors, wanted = np.empty((3, *block.shape)), EVERYWHERE if wanted is None else wanted
+        if heights.size == 1:  # compiled code knows one kind of heights only
+            position[2] -= heights.item()
+            heights = LEVEL
+        towards(position, np.ascontiguousarray(heights), transform, block.row, block.col, wanted, vectors)
         return Look(vectors)
 
     def check(self, grid: Grid, highest_m: float) -> None:
