@@ -24,7 +24,8 @@ ANGLE_NAMES = (
     "view_azimuth",
 )
 FASTER_CODEC: dict[str, dict[str, Any]] = {"none": {"compress": "zstd"}, "deflate": {"zlevel": 1}}
-"""for layers that no image set an example for, by the image's codec: flags become small by any, and fast by these"""
+"""by the image's codec, for layers that it sets no example for: flags and what was removed, mostly 0, become small by
+any codec, and fast by these"""
 FLAG_TAGS = {f"FLAG_BIT_{flag.value.bit_length() - 1}": str(flag.name) for flag in SINGLE_FLAGS} | {
     "FLAG_BITS_6_7": "SPECULAR_STATE: 0 negligible, 1 corrected, 2 uncorrectable, 3 not assessed"
 }
@@ -93,7 +94,7 @@ def writer_of(
     if (codec := scene.config.output.compression) is not None:
         profile["compress"] = codec
     layer = layer_of(scene, name)
-    if not layer.of_image:
+    if not layer.of_image or name == "removed":
         profile |= FASTER_CODEC.get(profile["compress"], {})
     like = image if strip is None else image.crop(strip)
     if scene.config.output.format == "envi":
