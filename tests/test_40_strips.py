@@ -22,7 +22,7 @@ from tscorr.config import load_config
 from tscorr.errors import InputError
 from tscorr.scene import correct, strips
 from tscorr.scene.overlap import overlaps
-from tscorr.scene.run import Sums
+from tscorr.scene.sums import Sums
 
 PRODUCTS = ["corrected", "flags", "removed", "azimuthal_width", "angles"]
 TIMES = {"seconds", "peak_rss_mb", "mpixel_per_s"}

@@ -23,8 +23,9 @@ from tscorr.scene.memory import give_back, peak_rss_mb
 from tscorr.scene.pictures import PICTURE_PX, Lights, draw_quicklook
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import written_products
-from tscorr.scene.run import Pipeline, Progress, Sums, silent
+from tscorr.scene.run import Pipeline, Progress, silent
 from tscorr.scene.styles import flag_style
+from tscorr.scene.sums import Sums
 from tscorr.scene.truth import coverage, residual_glare
 from tscorr.sensor import FrameView
 from tscorr.sun import solar_path

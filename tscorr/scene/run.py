@@ -1,10 +1,8 @@
 """A scene from files to files: read, correct, write, in blocks, by several workers."""
 
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -12,29 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tscorr import rasters
-from tscorr.angles import angle_between, facet_angles, true_azimuth, zenith_azimuth
-from tscorr.correction import (
-    SINGLE_FLAGS,
-    BlockInputs,
-    BlockResult,
-    Corrector,
-    add_angles,
-    add_tally,
-    class_rows,
-    new_tally,
-)
+from tscorr.correction import BlockInputs, BlockResult, Corrector, add_angles, class_rows
 from tscorr.correction.edges import ShadowByBrightness
-from tscorr.correction.sigmas import SigmaTally
-from tscorr.grid import Block, north_of
+from tscorr.grid import Block
+from tscorr.scene.angle_layers import AngleLayers
 from tscorr.scene.bad_bands import BadBands
 from tscorr.scene.cutting import threads_of, units_of, workers_of
 from tscorr.scene.ground import Ground
 from tscorr.scene.memory import keep_below
 from tscorr.scene.pictures import Lights
 from tscorr.scene.plan import Scene
-from tscorr.scene.products import ANGLE_NAMES, write_corrected_vrt, writer_of, written_products
+from tscorr.scene.products import write_corrected_vrt, writer_of, written_products
 from tscorr.scene.skipping import SHADOW_OR_NODATA, Idle, Skipping, tallied
-from tscorr.width import typical_lobe, width_table
+from tscorr.scene.sums import Sums
 
 Array = NDArray[Any]
 Progress = Callable[[int], None]
@@ -46,58 +34,7 @@ def silent(pixels: int) -> None:
     del pixels
 
 
-ANGLE_ROWS = 64
-"""rows whose angles are found at once: they are float64 meanwhile"""
 LEAST_CONFIDENCE = 0.5
-OF_EVERY_PIXEL = {"angles", "azimuthal_width"}
-"""products that need directions where no material with a peak is"""
-ANGLES_OF_SUN = {"incidence", "solar_zenith", "solar_azimuth"}
-
-
-class Sums:
-    """What the blocks of a scene add up to; integers and extremes, so that their order cannot matter."""
-
-    def __init__(self, materials: int, bands: int) -> None:
-        self.tally = new_tally(materials + 1, bands)
-        self.flags = np.zeros(1 << 16, np.int64)
-        self.sigmas = SigmaTally(materials + 1)
-        self.skipped = dict.fromkeys(
-            ("blocks", "blocks_no_specular_material", "blocks_out_of_reach", "blocks_shadow_or_nodata"), 0
-        )
-        self.seconds = dict.fromkeys(("read", "geometry", "kernel", "write"), 0.0)
-        self.peak_rss_mb = 0.0
-        """of other processes that worked on the scene"""
-        self._lock = threading.Lock()
-
-    def add(self, result: BlockResult, rows: Array, kind: str | None) -> None:
-        """Add a block of these rows of the corrector; `kind` says why most of its work was skipped, if it was."""
-        from tscorr.scene.compiled import count_values
-
-        counts = np.zeros(1 << 16, np.int64)
-        count_values(result.flags, counts)
-        with self._lock:
-            add_tally(self.tally, result.tally)
-            self.flags += counts
-            if result.sigma is not None:
-                self.sigmas.add(result.sigma, result.flags, rows)
-            self.skipped["blocks"] += 1
-            if kind is not None:
-                self.skipped[kind] += 1
-
-    def flag_counts(self) -> dict[str, int]:
-        """Pixels with each flag, by name."""
-        found = np.flatnonzero(self.flags)
-        return {str(flag.name): int(self.flags[found[found & flag != 0]].sum()) for flag in SINGLE_FLAGS}
-
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        """Add the time of a block of code to one part of the work; summed over the workers."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            with self._lock:
-                self.seconds[part] += time.perf_counter() - start
 
 
 class Pipeline:
@@ -114,8 +51,6 @@ class Pipeline:
         self._masks = masks
         self._products = written_products(scene)
         self._as_difference = scene.config.output.corrected == "vrt"
-        self._is_whole = not scene.config.run.skip or bool(self._products & OF_EVERY_PIXEL)
-        """directions are wanted of all pixels, not of those with a lobe only"""
         self._weighted = scene.confidence is not None and scene.config.correction.weigh_by_confidence
         self.corrector = Corrector(
             scene.materials,
@@ -133,11 +68,7 @@ class Pipeline:
         self.written: dict[str, rasters.RasterInfo] = {}
         """the rasters by product, once they are whole"""
         self._skipping = Skipping(scene, self.corrector.peaks)
-        self._north = north_of(scene.grid)
-        self._tables = [
-            width_table(typical_lobe(parameters), rules.form) if peak else None
-            for (_, parameters, rules), peak in zip(scene.materials, self.corrector.peaks[1:], strict=True)
-        ]
+        self._angle_layers = AngleLayers(scene, self._products, self.corrector.peaks)
 
     def open(self, files: ExitStack) -> None:
         """Open the rasters of the scene; `files` closes them."""
@@ -275,7 +206,7 @@ class Pipeline:
         """A block without its specular part, and the layers of angles and widths that are asked for."""
         with self.sums.timed("geometry"):
             inputs, unseen = self.inputs(block, image, rows, needed, shade)
-        layers = self._angle_layers(block, inputs, unseen)
+        layers = self._angle_layers.of_block(block, inputs, unseen)
         with self.sums.timed("kernel"):
             want_removed = "removed" in self._products and len(image) > 0
             return self.corrector(inputs, first_row=block.row, want_removed=want_removed), layers
@@ -319,7 +250,7 @@ class Pipeline:
         if shade is None and needed.any():
             shade = self.ground.shadowed(block)
         confidence = self._class_confidence(block)
-        wanted = None if self._is_whole else needed
+        wanted = None if self._angle_layers or not scene.config.run.skip else needed
         heights, normal, unreliable = self.ground.surface.relief(block, wanted)
         view, seconds, unseen = scene.view.look(scene.grid, block, heights, wanted)
         sun = scene.sun.vectors(block, seconds)
@@ -366,51 +297,6 @@ class Pipeline:
             return None
         shadowed, unsure = shade
         return self._by_brightness.settle(shadowed, unsure & needed, image, rows, sun, normal)
-
-    def _angle_layers(self, block: Block, inputs: BlockInputs, unseen: Array | None) -> dict[str, Array]:
-        """The layers of angles and widths that are asked for, float32; nan where they need a view and are unseen."""
-        layers: dict[str, Array] = {}
-        if "azimuthal_width" in self._products:
-            layers["azimuthal_width"] = self._azimuthal_width(inputs)[None]
-        if "angles" in self._products:
-            layers["angles"] = np.empty((len(ANGLE_NAMES), *block.shape), np.float32)
-            for first in range(0, block.height, ANGLE_ROWS):
-                rows = slice(first, min(first + ANGLE_ROWS, block.height))
-                part = Block(block.row + first, block.col, rows.stop - first, block.width)
-                layers["angles"][:, rows] = self._angles(
-                    part, *(_rows_of(v, rows) for v in (inputs.sun, inputs.view, inputs.normal))
-                )
-            if unseen is not None:
-                of_view = [i for i, name in enumerate(ANGLE_NAMES) if name not in ANGLES_OF_SUN]
-                layers["angles"][of_view] = np.where(unseen, np.float32(np.nan), layers["angles"][of_view])
-        return layers
-
-    def _angles(self, block: Block, sun: Array, view: Array, normal: Array) -> Array:
-        """The angles of a block from its vectors, in the order of ANGLE_NAMES."""
-        angles = facet_angles(sun, view, normal)
-        for name, vectors in (("solar", sun), ("view", view)):
-            zenith, azimuth = zenith_azimuth(vectors)
-            constant = vectors.shape[1:] == (1, 1)  # then the direction was given for the centre
-            convergence = self.scene.sun.convergence_deg if constant else self._north.convergence_deg(block)
-            angles |= {f"{name}_zenith": zenith, f"{name}_azimuth": true_azimuth(azimuth, convergence)}
-        return np.stack([np.broadcast_to(angles[name], block.shape).astype(np.float32) for name in ANGLE_NAMES])
-
-    def _azimuthal_width(self, inputs: BlockInputs) -> Array:
-        """Azimuthal width of the peak for the material and incidence of each pixel, nan where none. [deg]"""
-        rows = inputs.material
-        widths = np.full(rows.shape, np.nan, np.float32)
-        if self.corrector.peaks[rows].any():
-            incidence = np.broadcast_to(angle_between(inputs.sun, inputs.normal), rows.shape)
-            for row, table in enumerate(self._tables, start=1):
-                mine = rows == row
-                if table is not None and mine.any():
-                    widths[mine] = table.at(incidence[mine])
-        return widths
-
-
-def _rows_of(vectors: Array, rows: slice) -> Array:
-    """Some rows of vectors (3, rows, cols), either of which may be one for all."""
-    return vectors if vectors.shape[1] == 1 else vectors[:, rows]
 
 
 def _doubtful(confidence: Array | None) -> Array | None:

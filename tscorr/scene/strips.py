@@ -30,7 +30,8 @@ from tscorr.scene.ground import Ground
 from tscorr.scene.memory import peak_rss_mb
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import write_corrected_vrt, written_products
-from tscorr.scene.run import Pipeline, Progress, Sums, silent
+from tscorr.scene.run import Pipeline, Progress, silent
+from tscorr.scene.sums import Sums
 
 MASKS, SUMS = "masks", "sums.json"
 

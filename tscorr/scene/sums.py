@@ -1,0 +1,61 @@
+"""What the blocks of a scene add up to."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tscorr.correction import SINGLE_FLAGS, BlockResult, add_tally, new_tally
+from tscorr.correction.sigmas import SigmaTally
+
+Array = NDArray[Any]
+
+
+class Sums:
+    """What the blocks of a scene add up to; integers and extremes, so that their order cannot matter."""
+
+    def __init__(self, materials: int, bands: int) -> None:
+        self.tally = new_tally(materials + 1, bands)
+        self.flags = np.zeros(1 << 16, np.int64)
+        self.sigmas = SigmaTally(materials + 1)
+        self.skipped = dict.fromkeys(
+            ("blocks", "blocks_no_specular_material", "blocks_out_of_reach", "blocks_shadow_or_nodata"), 0
+        )
+        self.seconds = dict.fromkeys(("read", "geometry", "kernel", "write"), 0.0)
+        self.peak_rss_mb = 0.0
+        """of other processes that worked on the scene"""
+        self._lock = threading.Lock()
+
+    def add(self, result: BlockResult, rows: Array, kind: str | None) -> None:
+        """Add a block of these rows of the corrector; `kind` says why most of its work was skipped, if it was."""
+        from tscorr.scene.compiled import count_values
+
+        counts = np.zeros(1 << 16, np.int64)
+        count_values(result.flags, counts)
+        with self._lock:
+            add_tally(self.tally, result.tally)
+            self.flags += counts
+            if result.sigma is not None:
+                self.sigmas.add(result.sigma, result.flags, rows)
+            self.skipped["blocks"] += 1
+            if kind is not None:
+                self.skipped[kind] += 1
+
+    def flag_counts(self) -> dict[str, int]:
+        """Pixels with each flag, by name."""
+        found = np.flatnonzero(self.flags)
+        return {str(flag.name): int(self.flags[found[found & flag != 0]].sum()) for flag in SINGLE_FLAGS}
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Add the time of a block of code to one part of the work; summed over the workers."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self.seconds[part] += time.perf_counter() - start
