@@ -43,7 +43,7 @@ def test_a_committed_folder_has_its_files_and_a_manifest_of_their_hashes(tmp_pat
 def test_files_that_are_hashed_early_have_the_same_entries(tmp_path):
     with publish.Publication(tmp_path / "out") as publication:
         (publication.folder / "a.txt").write_bytes(b"a" * 3_000_000)
-        publication.hash_early([publication.folder / "a.txt"])
+        publication.hash_early(publication.folder / "a.txt")
         (publication.folder / "b.txt").write_bytes(b"b")
         publication.commit({})
     outputs = json.loads((tmp_path / "out" / publish.MANIFEST).read_text())["outputs"]

@@ -92,20 +92,21 @@ class Publication:
         self._hasher.shutdown(cancel_futures=True)
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def hash_early(self, files: Iterable[Path]) -> None:
-        """Start to hash files of the folder that are whole, where a thread is free while others are still written."""
+    def hash_early(self, path: Path) -> None:
+        """Start to hash a file of the folder that is whole, where a thread is free while others are still written."""
         if self._threads > 1:
-            self._hash(files)
+            self._hash(path)
 
-    def _hash(self, files: Iterable[Path]) -> None:
-        for path in files:
+    def _hash(self, path: Path) -> None:
+        if path not in self._hashes:
             self._hashes[path] = self._hasher.submit(sha256, path)
 
     def commit(self, manifest: Mapping[str, Any]) -> None:
         """Write the manifest with the hashes of all files, flush, and take the target's place."""
         try:
             files = sorted(path for path in self.folder.iterdir() if path.name != MANIFEST)
-            self._hash(path for path in files if path not in self._hashes)
+            for path in files:
+                self._hash(path)
             outputs = {
                 path.name: {"sha256": self._hashes[path].result(), "bytes": path.stat().st_size} for path in files
             }

@@ -20,7 +20,7 @@ from tscorr.rasters.joining import join_rows, result
 from tscorr.rasters.kept import KeptReader
 from tscorr.rasters.reading import Reader, read_samples
 from tscorr.rasters.stored_tiles import StoredTiles
-from tscorr.rasters.writing import Layer, Writer, make_cog
+from tscorr.rasters.writing import Layer, Writer, make_cog, unwatched
 
 __all__ = [
     "ENVI_SUFFIX",
@@ -48,5 +48,6 @@ __all__ = [
     "read_decimated_flags",
     "read_samples",
     "result",
+    "unwatched",
     "write_difference",
 ]

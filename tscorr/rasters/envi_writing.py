@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from tscorr.grid import Block
 from tscorr.rasters import envi
 from tscorr.rasters.header import ENVIRONMENT, RasterInfo, describe
 from tscorr.rasters.reading import Reader
-from tscorr.rasters.writing import Layer, Stretch, checksum, read_at, write_at
+from tscorr.rasters.writing import Layer, Stretch, checksum, read_at, unwatched, write_at
 
 Array = NDArray[Any]
 
@@ -80,8 +80,12 @@ class EnviWriter:
         """Close without a check; what was written will be deleted."""
         os.close(self._file)
 
-    def close(self) -> RasterInfo:
-        """Close; what the header says. Raises OutputError unless every block reads back as it was written."""
+    def close(self, final: Callable[[Path], None] = unwatched) -> RasterInfo:
+        """Close; what the header says. Raises OutputError unless every block reads back as it was written.
+
+        final : called once the file does not change any more, before it is read.
+        """
+        final(self.path)
         try:
             whole = all(checksum(self._read(block)) == expected for block, expected in self._written.items())
         finally:

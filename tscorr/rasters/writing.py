@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +27,11 @@ Array = NDArray[Any]
 COG_TILE = 512
 ZSTD_LEVEL = 1
 """of what is written once and read often GDAL would have 9, which takes seven times as long for a few per cent"""
+
+
+def unwatched(path: Path) -> None:
+    """Nobody waits for a file."""
+    del path
 
 
 class Writer:
@@ -134,11 +139,15 @@ class Writer:
         """Close without a check; what was written will be deleted."""
         os.close(self._file)
 
-    def close(self) -> RasterInfo:
-        """Close; what the header says. Raises OutputError unless every block reads back as it was written."""
+    def close(self, final: Callable[[Path], None] = unwatched) -> RasterInfo:
+        """Close; what the header says. Raises OutputError unless every block reads back as it was written.
+
+        final : called once the file does not change any more, before it is read.
+        """
         try:
             for words, numbers in ((self._places.offsets, self._offsets), (self._places.sizes, self._sizes)):
                 write_at(self._file, tiff.octets(numbers.astype(words.dtype)), words.start)
+            final(self.path)
             whole = (self._sparse or bool(self._sizes.all())) and all(
                 checksum(read_at(self._file, stretch)) == stretch.checksum for stretch in self._written
             )

@@ -94,7 +94,7 @@ def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
         publish.EarlyHashes(scene.inputs) as hashes,
         publish.Publication(target_of(scene), threads_of(scene)) as publication,
     ):
-        pipeline = Pipeline(scene, publication.folder)
+        pipeline = Pipeline(scene, publication.folder, final=publication.hash_early)
         sums, lights, written = pipeline.run(progress), pipeline.lights, pipeline.written
         del pipeline  # and the heights that it keeps
         give_back()
@@ -116,7 +116,8 @@ def finish(
     written : rasters by product whose headers need not be read.
     """
     folder = publication.folder
-    publication.hash_early(sorted(folder.iterdir()))
+    for path in sorted(folder.iterdir()):
+        publication.hash_early(path)
     facts = facts_of(scene, sums, wall_s)
     report = summary(facts)
     if "flags" in scene.config.output.products:

@@ -42,13 +42,22 @@ class Pipeline:
 
     strip : rows of the scene to do, all columns of them; all if None.
     masks : what `Ground.save` wrote of the whole scene; found by this pipeline itself if None.
+    final : called with the path of each raster that does not change any more, while it is checked.
     """
 
-    def __init__(self, scene: Scene, folder: Path, strip: Block | None = None, masks: Path | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        folder: Path,
+        strip: Block | None = None,
+        masks: Path | None = None,
+        final: Callable[[Path], None] = rasters.unwatched,
+    ) -> None:
         self.scene = scene
         self.folder = folder
         self._strip = strip
         self._masks = masks
+        self._final = final
         self._products = written_products(scene)
         self._as_difference = scene.config.output.corrected == "vrt"
         self._weighted = scene.confidence is not None and scene.config.correction.weigh_by_confidence
@@ -114,9 +123,9 @@ class Pipeline:
 
     def _close(self, writer: rasters.Writer | rasters.EnviWriter) -> rasters.RasterInfo:
         """Close and check one raster; make it what was asked for."""
-        info = writer.close()
         if self.scene.config.output.format != "cog":
-            return info
+            return writer.close(self._final)
+        writer.close()
         rasters.make_cog(writer.path, bits=writer is self.writers.get("flags"))
         return rasters.describe(writer.path, ours=True)
 
