@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[1] / "tscorr"
 FLOORS = {
     0: "errors texts angles grid kernels",
     1: "reference materials sun sensor",
-    2: "terrain width fit correction config",
+    2: "terrain width fit correction config eye",
     3: "rasters publish report stac bench quicklook",
     4: "scene",
     5: "batch",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread  # Pillow
 
-from tscorr import quicklook
+from tscorr import eye, quicklook
 from tscorr.errors import InputError, OutputError
 
 DELFT_UM = [0.475, 0.560, 0.668, 0.717, 0.840]
@@ -44,12 +44,22 @@ def test_grey_of_18_percent_is_grey_0461(name):
     np.testing.assert_allclose(rgb, rgb[0, 0, 0], atol=1e-6)
 
 
-def test_a_picture_changes_nothing_about_how_arrays_are_printed():
+@pytest.mark.parametrize("interpreter", [sys.executable, "/nowhere/python"])
+def test_a_picture_changes_nothing_about_how_arrays_are_printed(interpreter):
     script = (
-        "import numpy as np; before = np.get_printoptions(); from tscorr.quicklook import rgb_matrix; "
-        "rgb_matrix([0.45, 0.55, 0.65]); assert np.get_printoptions() == before, np.get_printoptions()"
+        "import sys, numpy as np; before = np.get_printoptions(); from tscorr.quicklook import rgb_matrix; "
+        f"sys.executable = '{interpreter}'; rgb_matrix([0.45, 0.55, 0.65]); print('colour' in sys.modules); "
+        "assert np.get_printoptions() == before, np.get_printoptions()"
     )
-    subprocess.run([sys.executable, "-c", script], check=True)
+    said = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout
+    assert said.strip() == str(interpreter != sys.executable)  # colour-science takes 130 MB, and keeps them
+
+
+def test_tables_of_the_eye_are_the_same_from_another_process_and_from_this_one(monkeypatch):
+    asked = eye.eye()
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    for one, two in zip(asked, eye._asked.__wrapped__(), strict=True):
+        assert np.array_equal(one, two)
 
 
 def test_exposure_multiplies_linear_light():

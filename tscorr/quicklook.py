@@ -1,13 +1,12 @@
 """Previews: bands to colours, and one picture of before, after and flags.
 
-The only module that knows colour-science and OpenImageIO; both are imported where they are used.
+The only module that knows OpenImageIO, which is imported where it is used; `eye` knows colour-science.
 
 Bands become colours by one (bands, 3) matrix, in linear light: true colour through the CIE 1931 2 degree
 observer under D65, near-infrared false colour, or, where wavelengths are unknown, the first bands as they
 come. Images are expected decimated; `linear_rgb` takes bands one by one, so a reader need not hold them all.
 """
 
-import threading
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
@@ -17,14 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tscorr.errors import InputError, OutputError
+from tscorr.eye import eye
 
 Array = NDArray[np.float32]
 Style = Literal["true_colour", "false_colour"]
 
 VISIBLE_UM = (0.38, 0.78)
 FALSE_COLOUR_UM = {"near-infrared": (0.75, 1.00), "red": (0.60, 0.70), "green": (0.50, 0.60)}
-_importing = threading.Lock()
-"""scenes are drawn side by side, and one must not keep what another has changed"""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB, IEC 61966-2-1
 NO_DATA_GREY = 0.5
 
@@ -69,7 +67,7 @@ def rgb_matrix(wavelengths_um: ArrayLike, fwhm_um: ArrayLike | None = None, styl
 def shown_bands(wavelengths_um: ArrayLike) -> list[int]:
     """Indices of the bands that true colour can show: the visible ones, else the first three, or the first as grey.
 
-    Tells without colour-science, which takes 100 MB of memory.
+    Tells without colour-science.
     """
     centres = np.atleast_1d(np.asarray(wavelengths_um, dtype=float))
     visible = np.flatnonzero(_visible(centres)).tolist()
@@ -88,17 +86,9 @@ def _true_colour_matrix(centres_um: NDArray[np.float64], fwhm_um: NDArray[np.flo
     expanded to second order (van Cittert): 3 - 3 B + B^2. It undoes most of the blur, cannot amplify noise
     by more than 7 and keeps grey exactly grey.
     """
-    with _importing, np.printoptions():  # the package changes how numpy prints arrays, for everyone
-        import colour
-
-    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    illuminant = colour.SDS_ILLUMINANTS["D65"]
-    wavelength_um = observer.wavelengths / 1000.0  # every nanometre from 360 to 830
-    power = np.interp(observer.wavelengths, illuminant.wavelengths, illuminant.values)
-    to_xyz = observer.values * power[:, np.newaxis]
-
+    observer = eye()
     identity = np.eye(centres_um.size)
-    distance = wavelength_um[:, np.newaxis] - centres_um
+    distance = observer.wavelength_um[:, np.newaxis] - centres_um
     staircase = identity[np.abs(distance).argmin(axis=1)]
     has_width = fwhm_um > 0
     width = np.where(has_width, np.maximum(fwhm_um, 0.001), 0.001)  # the tables have steps of 1 nm
@@ -107,7 +97,7 @@ def _true_colour_matrix(centres_um: NDArray[np.float64], fwhm_um: NDArray[np.flo
     blur = np.where(has_width[:, np.newaxis], response.T @ staircase, identity)
     spectrum = staircase @ (3.0 * identity - 3.0 * blur + blur @ blur)
 
-    matrix: NDArray[np.float64] = spectrum.T @ to_xyz @ colour.models.RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB.T
+    matrix: NDArray[np.float64] = spectrum.T @ observer.to_xyz @ observer.to_rgb
     return matrix / matrix.sum(axis=0)  # white is (1, 1, 1), whatever the digits of the tables
 
 
