@@ -10,7 +10,7 @@ from small_scene import TILE, small_scene, write_config, write_image, write_inpu
 from tscorr import batch
 from tscorr.batch import local
 from tscorr.config import load_config
-from tscorr.scene.cutting import units_of
+from tscorr.scene.cutting import BASE_MB, units_of
 
 TIMES = {"seconds", "peak_rss_mb", "mpixel_per_s"}
 SCENES = [{"name": f"s{i}", "direct_fraction": 1 - 0.1 * i} for i in range(5)]
@@ -67,7 +67,7 @@ def test_two_workers_do_two_small_scenes_at_the_same_time(tmp_path):
     assert batch.run(config, progress=start).exit_code == 0
 
 
-@pytest.mark.parametrize("run", [{"workers": 1}, {"workers": 2, "memory_limit_mb": 383}])
+@pytest.mark.parametrize("run", [{"workers": 1}, {"workers": 2, "memory_limit_mb": BASE_MB + 2}])
 def test_one_worker_or_little_memory_does_one_scene_at_a_time(tmp_path, run):
     write_image(tmp_path / "image.tif", np.full((3, 128, 128), 4000, np.int16), blockxsize=128, blockysize=128)
     write_raster(tmp_path / "class_map.tif", np.full((128, 128), TILE, np.uint8))

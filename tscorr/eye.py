@@ -45,9 +45,7 @@ def _asked() -> Eye:
     """The tables, from another interpreter that finds the same packages; from this one where it has no other."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path or os.curdir for path in sys.path)}
     try:
-        answer = subprocess.run(
-            [sys.executable, "-m", "tscorr.eye"], env=environment, capture_output=True, check=True
-        )
+        answer = subprocess.run([sys.executable, "-m", "tscorr.eye"], env=environment, capture_output=True, check=True)
         return Eye(*map(np.array, json.loads(answer.stdout)))
     except (OSError, subprocess.CalledProcessError, ValueError):
         with np.printoptions():  # the package changes how numpy prints arrays, for everyone

@@ -137,6 +137,11 @@ class Corrector:
         return looked_up(rows, self.peaks.tobytes().ljust(256, b"\0")).view(np.bool_)
 
     @property
+    def is_compiled(self) -> bool:
+        """Whether only compiled code looks at directions, and that not where no pixel has a lobe."""
+        return all(engine.precision != "reference" for engine in self._engines)
+
+    @property
     def peaks(self) -> Array:
         """Which rows have a lobe to remove: bool (materials + 1,); row 0, no material, has none."""
         return np.logical_or.reduce([engine.table.peak for engine in self._engines])

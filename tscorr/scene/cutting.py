@@ -8,11 +8,11 @@ from tscorr.scene.plan import Scene
 
 UNIT_COLUMNS = 2048
 STRIPE_COLUMNS = 6144
-BASE_MB = 380
+BASE_MB = 340
 """memory of the process before the first block, and of what does not grow with blocks"""
 COPIES = 5
 """an image block and what is made of it, at most, in blocks of the image's own size"""
-GEOMETRY_BYTES = 72
+GEOMETRY_BYTES = 48
 """vectors, angles and masks of a pixel"""
 LAYER_BYTES = {"angles": 48, "azimuthal_width": 48}
 """what the layers that are asked for add to that, with what they are made of"""

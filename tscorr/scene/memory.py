@@ -5,7 +5,7 @@ import resource
 import sys
 from pathlib import Path
 
-HEADROOM_MB = 60
+HEADROOM_MB = 35
 """what is free is given back this long before the limit: the blocks that are worked on grow meanwhile"""
 WORTH_MB = 30
 """growth since the last time for which it is worth the while"""

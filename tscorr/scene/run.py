@@ -259,7 +259,8 @@ class Pipeline:
         if shade is None and needed.any():
             shade = self.ground.shadowed(block)
         confidence = self._class_confidence(block)
-        wanted = None if self._angle_layers or not scene.config.run.skip else needed
+        sparing = scene.config.run.skip and self.corrector.is_compiled and not self._angle_layers
+        wanted = needed if sparing else None
         heights, normal, unreliable = self.ground.surface.relief(block, wanted)
         view, seconds, unseen = scene.view.look(scene.grid, block, heights, wanted)
         sun = scene.sun.vectors(block, seconds)
