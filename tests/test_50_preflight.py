@@ -82,7 +82,8 @@ def test_a_stored_scale_makes_a_confidence_in_per_cent_right(tmp_path):
 def test_a_disk_that_is_too_small_is_told_with_the_estimate(tmp_path, monkeypatch, caplog):
     config = small_scene(tmp_path, {"name": "a"}, {"name": "b"})
     stored = min((tmp_path / "image.tif").stat().st_size, SHAPE[0] * SHAPE[1] * BANDS * 2)
-    raw = SHAPE[0] * SHAPE[1] * (BANDS * 2 + 2 + BANDS * 2) + forecast.BESIDE_BYTES  # corrected and removed, flags
+    pixel = BANDS * 2 + 2 + BANDS * 2 + 2 / 8  # corrected, flags and removed, two masks
+    raw = SHAPE[0] * SHAPE[1] * pixel + forecast.BESIDE_BYTES
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(preflight.shutil, "disk_usage", lambda _: usage._replace(free=2 * stored - 1))
     (line,) = problems(config, OutputError)

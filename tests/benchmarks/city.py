@@ -124,7 +124,7 @@ def write_config(
     name : of the configuration. form : of the files. corrected : a file, or a VRT. run : keys of [run].
     """
     with rasterio.open(image) as file:
-        rows, cols = file.shape
+        (rows, cols), bands = file.shape, file.count
     side_m = CELL_M * max(rows, cols)
     middle = WEST + cols * CELL_M / 2, NORTH - rows * CELL_M / 2
     scene = {
@@ -136,6 +136,8 @@ def write_config(
         "surface": {"kind": "flat"} if flat else {"kind": "dsm", "path": str(image.with_name("dsm.tif"))},
         "shadows": shadows,
     }
+    if quicklook:
+        scene["wavelength_um"] = np.linspace(0.45, 0.85, bands).tolist()  # in true colour
     values = {
         "output": {
             "directory": str(image.with_name("out")),

@@ -12,7 +12,7 @@ from tscorr import rasters
 from tscorr.batch.outcome import SceneOutcome, SceneProgress
 from tscorr.errors import TscorrError
 from tscorr.scene.correct import correct_scene, is_current, target_of
-from tscorr.scene.cutting import BASE_MB, blocks_mb, threads_of, units_of, wanted_workers
+from tscorr.scene.cutting import BASE_MB, scene_mb, threads_of, units_of, wanted_workers
 from tscorr.scene.memory import give_back
 from tscorr.scene.plan import Scene
 
@@ -87,7 +87,7 @@ def _fit(scenes: Sequence[Scene]) -> bool:
     """Whether scenes can be worked on at the same time: with a thread for each of their blocks, and the memory."""
     if any(map(_is_large, scenes)):
         return False
-    threads, memory_mb = sum(map(threads_of, scenes)), BASE_MB + sum(map(blocks_mb, scenes))
+    threads, memory_mb = sum(map(threads_of, scenes)), BASE_MB + sum(map(scene_mb, scenes))
     return threads <= wanted_workers(scenes[0]) and memory_mb <= scenes[0].config.run.memory_limit_mb
 
 

@@ -109,7 +109,8 @@ class Means:
         self, fine: tuple[int, int], coarse: tuple[int, int], layers: int, counted: int | None = None
     ) -> None:
         self.cells = Cells(fine, coarse)
-        self._total, self._count = np.zeros((layers, *coarse)), np.zeros((counted or layers, *coarse), np.float32)
+        self._total = np.zeros((layers, *coarse), np.float32)  # exact to 16 million, whatever the order
+        self._count = np.zeros((counted or layers, *coarse), np.float32)
         self._lock = threading.Lock()
 
     def add(self, block: Block, sums: Array, counts: Array) -> None:

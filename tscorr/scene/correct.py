@@ -131,7 +131,8 @@ def finish(
         report["bad_bands"] = scene.bad_names
     if (covered := coverage(scene, folder)) is not None:
         report["coverage"] = covered
-    picture = draw_quicklook(scene, folder, results, lights) if scene.config.output.quicklook else None
+    wanted = scene.config.output.quicklook
+    picture = draw_quicklook(scene, folder, results, lights, threads_of(scene)) if wanted else None
     write_json(report, folder / "report.json")
     widths = _decimated_widths(results)
     (folder / "report.html").write_text(page(report, facts, picture, widths), encoding="utf-8")

@@ -4,12 +4,13 @@ import os
 
 from tscorr import rasters
 from tscorr.grid import Block, blocks
+from tscorr.scene.pictures import lights_mb
 from tscorr.scene.plan import Scene
 
 UNIT_COLUMNS = 2048
 STRIPE_COLUMNS = 6144
 BASE_MB = 340
-"""memory of the process before the first block, and of what does not grow with blocks"""
+"""memory of the process before the first block, and of what does not grow with blocks nor differ between scenes"""
 COPIES = 5
 """an image block and what is made of it, at most, in blocks of the image's own size"""
 GEOMETRY_BYTES = 48
@@ -43,8 +44,7 @@ def units_of(scene: Scene, strip: Block | None = None, workers: int | None = Non
     image = scene.image if strip is None else scene.image.crop(strip)
     rows, cols = image.shape
     tile_rows, tile_cols = image.written_tile
-    memory_mb = scene.config.run.memory_limit_mb - BASE_MB
-    room = memory_mb * 1e6 / (workers or workers_of(scene)) / work_bytes(scene)  # pixels
+    room = _room_mb(scene) * 1e6 / (workers or workers_of(scene)) / work_bytes(scene)  # pixels
     widest = cols if tile_cols >= cols else max(1, UNIT_COLUMNS // tile_cols) * tile_cols
     width = min(widest, max(1, int(room / tile_rows / tile_cols)) * tile_cols)
     height = max(1, min(int(room / min(width, cols)), 512) // tile_rows) * tile_rows
@@ -66,7 +66,12 @@ def workers_of(scene: Scene) -> int:
     """Threads that may work on the blocks of a scene: no more than the memory limit feeds."""
     rows, cols = map(min, scene.image.tile, scene.image.shape)
     tile_mb = rows * cols * work_bytes(scene) / 1e6
-    return max(1, min(wanted_workers(scene), int((scene.config.run.memory_limit_mb - BASE_MB) / tile_mb)))
+    return max(1, min(wanted_workers(scene), int(_room_mb(scene) / tile_mb)))
+
+
+def _room_mb(scene: Scene) -> float:
+    """Memory that the limit of the configuration leaves to blocks."""
+    return scene.config.run.memory_limit_mb - BASE_MB - lights_mb(scene)
 
 
 def threads_of(scene: Scene) -> int:
@@ -74,12 +79,12 @@ def threads_of(scene: Scene) -> int:
     return min(workers_of(scene), len(units_of(scene)))
 
 
-def blocks_mb(scene: Scene) -> float:
-    """Memory that the blocks take which are worked on at a time."""
+def scene_mb(scene: Scene) -> float:
+    """Memory that a scene adds to that of the process: the blocks which are worked on at a time, and its picture."""
     largest = max(block.height * block.width for block in units_of(scene))
-    return threads_of(scene) * largest * work_bytes(scene) / 1e6
+    return threads_of(scene) * largest * work_bytes(scene) / 1e6 + lights_mb(scene)
 
 
 def memory_mb(scene: Scene) -> float:
-    """Memory that a scene takes, about: what does not grow with blocks, and a block for each worker."""
-    return BASE_MB + blocks_mb(scene)
+    """Memory that the process takes with a scene, about: what does not grow with blocks, and a block a worker."""
+    return BASE_MB + scene_mb(scene)

@@ -20,6 +20,8 @@ OVERVIEWS = 4 / 3
 """size of a raster with its overviews, over that without"""
 BESIDE_BYTES = 3e6
 """report, picture and colour table"""
+MASK_BYTES = 0.25
+"""of a pixel: one bit that says whether the sun sees it, one whether the sensor does; while the scene is worked on"""
 
 
 def forecast(scene: Scene) -> dict[str, Any]:
@@ -71,7 +73,7 @@ def disk_bytes(scene: Scene) -> tuple[float, float]:
     products = written_products(scene)
     each = [sizes.get(product, image_bytes) for product in products]
     most = sum(each) * OVERVIEWS + max(each, default=0) if output.format == "cog" else sum(each)
-    most += BESIDE_BYTES
+    most += BESIDE_BYTES + MASK_BYTES * pixels
     if "corrected" not in products:
         return 0.0, most
     codec = output.compression or image.profile["compress"]

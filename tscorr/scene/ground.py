@@ -13,7 +13,7 @@ from rasterio.enums import Resampling
 
 from tscorr import config, rasters
 from tscorr.correction.edges import dilated, rim
-from tscorr.errors import InputError
+from tscorr.errors import InputError, OutputError
 from tscorr.grid import Block
 from tscorr.scene.directions import obs_normals
 from tscorr.scene.plan import Scene
@@ -31,14 +31,18 @@ SAMPLES = 4
 """the survey looks at SAMPLES x SAMPLES windows of SAMPLE_PX"""
 MARGIN_PX = 512
 """pixels around the image that are looked at for what they hide; farther things cast no shadow"""
-LIT, SEEN = "lit.npy", "seen.npy"
+LIT, SEEN = "lit.bits", "seen.bits"
 
 
 class Ground:
-    """Surface, shadows and occlusion of a scene; close it to close its files."""
+    """Surface, shadows and occlusion of a scene; close it to close its files.
 
-    def __init__(self, scene: Scene) -> None:
+    folder : on whose disk the masks of what is in shadow or hidden are kept, two bits a pixel in nameless files.
+    """
+
+    def __init__(self, scene: Scene, folder: Path) -> None:
         self._scene = scene
+        self._folder = folder
         self._files = ExitStack()
         self._heights = self._heights_reader()
         self._shared_heights = rasters.KeptReader(self._heights).read if self._heights is not None else None
@@ -141,15 +145,18 @@ class Ground:
         if not self.is_swept:
             return
         if masks is not None:
-            self._lit, self._seen = (
-                BitMask.load(masks / name, self._scene.image.shape) if (masks / name).exists() else None
-                for name in (LIT, SEEN)
-            )
+            self._lit, self._seen = (self._loaded(masks / name) for name in (LIT, SEEN))
             return
         assert self.surface is not None  # surveyed: the sweeps want its relief
         self._rows = rows
         self._lit = self._swept(lambda **scene: shadows.DirectionSweep(direction=self._sun(), **scene), self._sun())
         self._seen = self._seen_mask()
+
+    def _loaded(self, path: Path) -> BitMask | None:
+        """A mask that was saved, or None where there is none."""
+        if not path.exists():
+            return None
+        return self._files.enter_context(closing(BitMask.load(path, self._scene.image.shape)))
 
     def save(self, folder: Path) -> None:
         """Write what `prepare` found, where it found anything."""
@@ -179,16 +186,22 @@ class Ground:
         return float(position[0] - x0), float(position[1] - y0), float(position[2])
 
     def _swept(self, sweep_of: Callable[..., shadows.Sweep], direction: Array | None = None) -> BitMask:
-        """The mask of a sweep over the image, and over what lies around it towards the source."""
+        """The mask of a sweep over the image, and over what lies around it towards the source.
+
+        OutputError where the disk has no room for it.
+        """
         rows, cols = self._scene.image.shape
         cell_x_m, cell_y_m = self._scene.grid.cell_size
         margin = self._margin(direction)
-        mask = BitMask((rows, cols))
         sweep = sweep_of(shape=(rows + 2 * margin, cols + 2 * margin), cell_x_m=cell_x_m, cell_y_m=cell_y_m)
         first, last = self._rows or (0, rows)
-        for strip in sweep.strips(STRIP_ROWS, (first + margin - 1, last + margin + 1)):
-            block = Block(strip.row - margin, strip.col - margin, strip.height, strip.width)
-            mask.narrow(block, sweep(strip, self._read_heights(block)))
+        try:
+            mask = self._files.enter_context(closing(BitMask.new((rows, cols), self._folder)))
+            for strip in sweep.strips(STRIP_ROWS, (first + margin - 1, last + margin + 1)):
+                block = Block(strip.row - margin, strip.col - margin, strip.height, strip.width)
+                mask.narrow(block, sweep(strip, self._read_heights(block)))
+        except OSError as error:
+            raise OutputError(f"the mask of shadows cannot be written to {self._folder}: {error}") from None
         return mask
 
     def _margin(self, direction: Array | None) -> int:

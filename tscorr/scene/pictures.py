@@ -23,7 +23,7 @@ PICTURE_PX = 768
 PREVIEW_PX = 2048
 """the longer side of a picture of one image, unless asked for otherwise"""
 MOST_GATHERED = 8
-"""bands of which before and after are kept beside the work: 9 MB each"""
+"""bands of which before and after are kept beside the work: 5 MB each"""
 BANDS_AT_ONCE = 8
 """bands of one file are read together: where they are stored together, each piece is then decoded once"""
 
@@ -45,9 +45,7 @@ class Lights:
     @classmethod
     def of(cls, scene: "Scene") -> Self | None:
         """None where no picture is asked for, the files are small and soon read again, or too many bands are shown."""
-        _, step = rasters.decimated(scene.image.shape, PICTURE_PX)
-        wanted = scene.config.output.quicklook and step >= rasters.LEAST_STEP
-        return cls(scene) if wanted and len(_shown(scene)) <= MOST_GATHERED else None
+        return cls(scene) if _are_gathered(scene) else None
 
     def of_block(self, block: Block, image: Array) -> tuple[Array, Array]:
         """Sums over cells of the stored values of a block (bands, rows, cols), and of how many pixels they are."""
@@ -82,15 +80,31 @@ class Lights:
         return Block(first, block.col, end - first, block.width)
 
 
+def lights_mb(scene: "Scene") -> float:
+    """Memory that the lights of a scene take: sums of before and after, and counts."""
+    (rows, cols), _ = rasters.decimated(scene.image.shape, PICTURE_PX)
+    return 2 * (len(_shown(scene)) + 1) * 4 * rows * cols / 1e6 if _are_gathered(scene) else 0.0
+
+
+def _are_gathered(scene: "Scene") -> bool:
+    _, step = rasters.decimated(scene.image.shape, PICTURE_PX)
+    wanted = scene.config.output.quicklook and step >= rasters.LEAST_STEP
+    return wanted and len(_shown(scene)) <= MOST_GATHERED
+
+
 def draw_quicklook(
-    scene: "Scene", folder: Path, results: Mapping[str, rasters.RasterInfo], lights: Lights | None = None
+    scene: "Scene",
+    folder: Path,
+    results: Mapping[str, rasters.RasterInfo],
+    lights: Lights | None = None,
+    threads: int = 1,
 ) -> Path:
     """The picture of before, after and flags, of a scene that is being published.
 
-    results : by product. lights : before and after, if they were gathered.
+    results : by product. lights : before and after, if they were gathered. threads : that may read them else.
     """
     wavelengths, matrix = _colours(scene)
-    before, after = _read_lights(scene, matrix, results) if lights is None else lights.images(matrix)
+    before, after = _read_lights(scene, matrix, results, threads) if lights is None else lights.images(matrix)
     path = folder / "quicklook.png"
     flag_file = results.get("flags")
     flags = np.zeros(before.shape[:2], np.uint16)
@@ -112,11 +126,11 @@ def _colours(scene: "Scene") -> tuple[tuple[float, ...], Array]:
     return wavelengths, quicklook.rgb_matrix(wavelengths, scene.image.fwhm_um)
 
 
-def _read_lights(scene: "Scene", matrix: Array, results: Mapping[str, rasters.RasterInfo]) -> tuple[Array, Array]:
+def _read_lights(
+    scene: "Scene", matrix: Array, results: Mapping[str, rasters.RasterInfo], threads: int
+) -> tuple[Array, Array]:
     """Before and after, from the files."""
-    from tscorr.scene.cutting import threads_of
-
-    with ThreadPoolExecutor(threads_of(scene)) as readers:  # to decode them is most of the work
+    with ThreadPoolExecutor(threads) as readers:  # to decode them is most of the work
         images = scene.image, results.get("corrected", scene.image)
         before, after = readers.map(partial(_light, scene, matrix), images)
     return before, after

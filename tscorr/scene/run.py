@@ -84,7 +84,7 @@ class Pipeline:
         scene = self.scene
         self.image = files.enter_context(rasters.Reader(scene.image))
         self.classes = files.enter_context(scene.classes())
-        self.ground = files.enter_context(Ground(scene))
+        self.ground = files.enter_context(Ground(scene, self.folder))
         self._confidence = None
         if scene.confidence is not None:
             self._confidence = files.enter_context(rasters.Reader(scene.confidence, scene.grid, fill=float("nan")))

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -126,7 +127,7 @@ class _Gatherer:
     def __init__(self, scene: Scene, key: int, per_stratum: int, files: ExitStack) -> None:
         self._scene = scene
         self._key = key
-        self._pipeline = Pipeline(scene, Path())  # its readers and directions; it writes nothing here
+        self._pipeline = Pipeline(scene, Path(gettempdir()))  # its readers and directions; it writes no result
         self._pipeline.open(files)
         self._pipeline.ground.prepare()
         self._reservoirs = {

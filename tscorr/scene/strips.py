@@ -97,7 +97,7 @@ def prepare(strips: Strips) -> None:
         return
     unfinished = masks.with_name(f"{MASKS}.{uuid4().hex[:8]}.part")
     unfinished.mkdir(parents=True)
-    with closing(scene), Ground(scene) as ground:
+    with closing(scene), Ground(scene, unfinished) as ground:
         if Corrector(scene.materials, scene.stored).peaks.any():
             ground.prepare()
             ground.save(unfinished)

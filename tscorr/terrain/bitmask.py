@@ -1,7 +1,10 @@
-"""A mask of a whole scene at one bit a pixel."""
+"""A mask of a whole scene at one bit a pixel, in a file: memory does not grow with the scene."""
 
+import os
+import shutil
+import tempfile
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,34 +15,60 @@ Mask = NDArray[np.bool_]
 
 
 class BitMask:
-    """True everywhere at first; `narrow` clears pixels, `read` answers for blocks, which may reach outside."""
+    """True everywhere at first; `narrow` clears pixels, `read` answers for blocks, which may reach outside.
 
-    def __init__(self, shape: tuple[int, int], bits: NDArray[Any] | None = None) -> None:
+    shape : (rows, cols) of the scene. file : a bit for each pixel, row by row, set where it was cleared.
+    Any thread may read, and one narrow before. Close it to close its file.
+    """
+
+    def __init__(self, shape: tuple[int, int], file: BinaryIO) -> None:
         self._shape = shape
-        self._bits = np.full((shape[0], -(-shape[1] // 8)), 255, np.uint8) if bits is None else bits
+        self._row_bytes = -(-shape[1] // 8)
+        self._file = file
 
-    def save(self, path: Path) -> None:
-        """Write the mask as an array of bytes."""
-        np.save(path, self._bits)
+    @classmethod
+    def new(cls, shape: tuple[int, int], folder: Path) -> Self:
+        """A mask in a nameless file on the disk of a folder; OSError where it cannot be made."""
+        file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed with the mask
+        mask = cls(shape, file)
+        file.truncate(shape[0] * mask._row_bytes)
+        return mask
 
     @classmethod
     def load(cls, path: Path, shape: tuple[int, int]) -> Self:
-        """A mask as `save` wrote it; of the file, only what is asked for is read."""
-        return cls(shape, np.load(path, mmap_mode="r"))
+        """A mask as `save` wrote it."""
+        return cls(shape, path.open("rb"))
+
+    def save(self, path: Path) -> None:
+        """Write the mask to a file with a name."""
+        self._file.seek(0)
+        with path.open("wb") as file:
+            shutil.copyfileobj(self._file, file)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
     def narrow(self, block: Block, mask: Mask) -> None:
-        """Keep of a block only what `mask` (rows, cols) says; what lies outside the scene is ignored."""
+        """Keep of a block only what `mask` (rows, cols) says; what lies outside the scene is ignored.
+
+        OSError where the disk is full.
+        """
         top, left = max(block.row, 0), max(block.col, 0)
         bottom = min(block.row + block.height, self._shape[0])
         right = min(block.col + block.width, self._shape[1])
         if top >= bottom or left >= right:
             return
         first, last = left // 8, -(-right // 8)
-        whole = np.ones((bottom - top, (last - first) * 8), np.bool_)
-        whole[:, left - first * 8 : right - first * 8] = mask[
+        cleared = np.zeros((bottom - top, (last - first) * 8), np.bool_)
+        cleared[:, left - first * 8 : right - first * 8] = ~mask[
             top - block.row : bottom - block.row, left - block.col : right - block.col
         ]
-        self._bits[top:bottom, first:last] &= np.packbits(whole, axis=1)
+        bits = self._rows(top, bottom)
+        bits[:, first:last] |= np.packbits(cleared, axis=1)
+        self._file.seek(top * self._row_bytes)
+        self._file.write(bits.data)
+        self._file.flush()
 
     def read(self, block: Block) -> Mask:
         """The mask of a block, (rows, cols); beyond the scene it goes on as at the nearest pixel."""
@@ -47,9 +76,15 @@ class BitMask:
         top, left = max(block.row, 0), max(block.col, 0)
         bottom, right = min(block.row + block.height, rows), min(block.col + block.width, cols)
         first, last = left // 8, -(-right // 8)
-        bits = np.unpackbits(self._bits[top:bottom, first:last], axis=1)[:, left - first * 8 : right - first * 8]
+        bits = np.unpackbits(self._rows(top, bottom)[:, first:last], axis=1)[:, left - first * 8 : right - first * 8]
         beyond = (
             (top - block.row, block.row + block.height - bottom),
             (left - block.col, block.col + block.width - right),
         )
-        return np.pad(bits.astype(np.bool_), beyond, mode="edge")
+        return np.pad(bits == 0, beyond, mode="edge")
+
+    def _rows(self, top: int, bottom: int) -> NDArray[Any]:
+        """The bits of whole rows: uint8 (rows, bytes)."""
+        size = (bottom - top) * self._row_bytes
+        octets = bytearray(os.pread(self._file.fileno(), size, top * self._row_bytes))
+        return np.frombuffer(octets, np.uint8).reshape(bottom - top, self._row_bytes)
