@@ -1,5 +1,6 @@
 """config: every problem is named with its place, its value and the nearest known key, before any work starts."""
 
+import datetime as dt
 import re
 from pathlib import Path
 
@@ -269,3 +270,16 @@ def test_defaults_are_those_of_the_design(tmp_path):
 def test_messages_speak_of_the_file_and_not_of_the_library(tmp_path):
     (line,) = problems(write_config(tmp_path, {"quantity": 7}))
     assert not re.search("pydantic|https?:", line)
+
+
+@pytest.mark.parametrize(
+    ("sun", "shown"),
+    [
+        ({"time": dt.time(12)}, "sun.time = 12:00:00; allowed is a date and a time with its zone"),
+        ({"time": dt.datetime(2026, 6, 21, 12)}, "sun.time = 2026-06-21 12:00:00; allowed is a date and"),  # noqa: DTZ001 - has no zone
+        ({"time": "noon"}, "sun.time = 'noon'; allowed is a date and a time with its zone, like 2026-06-21T10:12:00Z"),
+        ({"time": "FILL IN"}, "sun.time = 'FILL IN' is still to be filled in"),
+    ],
+)
+def test_a_wrong_time_is_shown_as_it_was_written(tmp_path, sun, shown):
+    assert shown in problem_of(tmp_path, {"sun": sun})

@@ -4,12 +4,14 @@ import os
 import tomllib
 import unicodedata
 from collections.abc import Iterator, Mapping
+from datetime import date, time
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from tscorr.config.sections import SURFACES, TABLES, VIEWS, Config, Scene
+from tscorr.config.template import FILL_IN
 from tscorr.errors import ConfigError, nearest
 from tscorr.texts import read_text
 
@@ -131,6 +133,11 @@ def _require_distinct(names: list[str], config: Path) -> None:
         known[folder] = name
 
 
+A_TIME = "a date and a time with its zone, like 2026-06-21T10:12:00Z"
+IN_WORDS = {"datetime": A_TIME, "timezone": A_TIME, "tuple": "a list of numbers"}
+"""what is allowed, by how pydantic's name of a problem begins, where its own words are of Python"""
+
+
 def _problem(path: Path, item: Mapping[str, Any], data: Mapping[str, Any]) -> str:
     """One line for one problem that pydantic found; scenes are called by their names in `data`, the file's content."""
     location = [part for i, part in enumerate(item["loc"]) if not _is_kind(item["loc"], i)]
@@ -151,7 +158,17 @@ def _problem(path: Path, item: Mapping[str, Any], data: Mapping[str, Any]) -> st
         return f"{path}: {where} is missing"
     if where == "file":
         return f"{path}: {message}"
-    return f"{path}: {where} = {item['input']!r}: {message[0].lower()}{message[1:]}"
+    if item["input"] == FILL_IN:
+        return f"{path}: {where} = {FILL_IN!r} is still to be filled in"
+    for kind, allowed in IN_WORDS.items():
+        if item["type"].startswith(kind):
+            return f"{path}: {where} = {_as_written(item['input'])}; allowed is {allowed}"
+    return f"{path}: {where} = {_as_written(item['input'])}: {message[0].lower()}{message[1:]}"
+
+
+def _as_written(value: Any) -> str:
+    """A value about as it stands in the file."""
+    return str(value) if isinstance(value, date | time) else repr(value)
 
 
 def _scene_label(scene: Any, number: int) -> str:
