@@ -25,7 +25,10 @@ from tscorr.terrain.surface import DsmSurface, FlatSurface, GivenNormals, RoofPl
 
 Array = NDArray[Any]
 
-STRIP_ROWS = 512
+STRIP_ROWS = 512, 256, 128, 64
+"""rows or columns that a sweep reads at once: the most of these with which it reads no more than STRIP_PIXELS, which
+take ten bytes each; as many as a tile has where that can be, since each is decoded once then"""
+STRIP_PIXELS = 16e6
 SAMPLE_PX = 256
 SAMPLES = 4
 """the survey looks at SAMPLES x SAMPLES windows of SAMPLE_PX"""
@@ -193,11 +196,13 @@ class Ground:
         rows, cols = self._scene.image.shape
         cell_x_m, cell_y_m = self._scene.grid.cell_size
         margin = self._margin(direction)
-        sweep = sweep_of(shape=(rows + 2 * margin, cols + 2 * margin), cell_x_m=cell_x_m, cell_y_m=cell_y_m)
+        shape = rows + 2 * margin, cols + 2 * margin
+        sweep = sweep_of(shape=shape, cell_x_m=cell_x_m, cell_y_m=cell_y_m)
+        lines = next((lines for lines in STRIP_ROWS if lines * max(shape) <= STRIP_PIXELS), STRIP_ROWS[-1])
         first, last = self._rows or (0, rows)
         try:
             mask = self._files.enter_context(closing(BitMask.new((rows, cols), self._folder)))
-            for strip in sweep.strips(STRIP_ROWS, (first + margin - 1, last + margin + 1)):
+            for strip in sweep.strips(lines, (first + margin - 1, last + margin + 1)):
                 block = Block(strip.row - margin, strip.col - margin, strip.height, strip.width)
                 mask.narrow(block, sweep(strip, self._read_heights(block)))
         except OSError as error:
