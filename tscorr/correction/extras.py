@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import chebyshev
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from tscorr import kernels, reference
@@ -19,7 +19,7 @@ from tscorr.materials import BandParameters, Material, material
 Array = NDArray[Any]
 
 METHODS = {"subtract": kernels.SUBTRACT, "ratio": kernels.RATIO, "reference": kernels.REFERENCE}
-DEGREE = kernels.VARIANCE_DEGREE
+DEGREE, LEAN_DEGREE = kernels.VARIANCE_DEGREE, kernels.LEAN_DEGREE
 NODES = 60
 
 
@@ -150,33 +150,36 @@ def _variance_rows(
     """Rows of Extras.variance and Extras.cross for the bands of one material.
 
     The gradient is linear in alpha^2 (by w) and depends else on the local angle alone, so the variance is quadratic in
-    alpha^2, with coefficients that are smooth in cos_l.
+    alpha^2, with coefficients that are smooth in cos_l: the square of what errs with w, and a rest. That is all there
+    is where alpha^2 makes the square 0, and so its relative errors are kept small.
     """
     cos_min = float(np.sin(np.deg2rad(90 - steepest)))
-    scale, shift = 2 / (1 - cos_min), -(1 + cos_min) / (1 - cos_min)
-    x = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
-    cos_l = (x - shift) / scale
+    nodes = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
+    cos_l = (1 - cos_min) / 2 * nodes + (1 + cos_min) / 2
     level = reference.Geometry(cos_l, cos_l, cos_l, np.zeros(NODES))
-    variance = np.zeros((len(by_band), 2 * DEGREE + 5))
+    variance = np.zeros((len(by_band), DEGREE + LEAN_DEGREE + 3))
     cross = np.zeros((len(by_band), DEGREE + 3))
     for b, row in enumerate(by_band):
         at_top = _log_gradient(level, row, ratio=ratio)
         by_alpha2 = np.zeros((5, 1))
         by_alpha2[2] = -2 * row[2] * np.rad2deg(1) ** 2
         c = covariance[b]
-        variance[b, : DEGREE + 1] = _powers(x, np.einsum("ia,ij,ja->a", at_top, c, at_top))
-        variance[b, DEGREE + 1 : 2 * DEGREE + 2] = _powers(x, 2 * (by_alpha2.T @ c @ at_top)[0])
-        variance[b, 2 * DEGREE + 2 :] = (by_alpha2.T @ c @ by_alpha2).item(), scale, shift
+        sigma_w = np.sqrt(c[2, 2])
+        with_w = (c[2] @ at_top) / sigma_w if sigma_w > 0 else np.zeros(NODES)
+        rest = np.maximum(np.einsum("ia,ij,ja->a", at_top, c, at_top) - with_w**2, 0)
+        variance[b, : DEGREE + 1] = _powers(cos_l, rest, DEGREE, 1 / np.maximum(rest, max(1e-3 * rest.max(), 1e-30)))
+        variance[b, DEGREE + 1 : -1] = _powers(cos_l, with_w, LEAN_DEGREE)
+        variance[b, -1] = -by_alpha2[2, 0] * sigma_w
         of_reference = gradients[b]
-        cross[b, : DEGREE + 1] = _powers(x, of_reference @ c @ at_top)
+        cross[b, : DEGREE + 1] = _powers(cos_l, of_reference @ c @ at_top, DEGREE)
         cross[b, DEGREE + 1 :] = (of_reference @ c @ by_alpha2).item(), of_reference @ c @ of_reference
     return variance, cross
 
 
-def _powers(x: Array, values: Array) -> Array:
-    """Coefficients (DEGREE + 1,) of the polynomial nearest to values at nodes x, lowest power first."""
-    found = chebyshev.cheb2poly(chebyshev.chebfit(x, values, DEGREE))
-    return np.pad(found, (0, DEGREE + 1 - len(found)))
+def _powers(x: Array, values: Array, degree: int, weight: Array | None = None) -> Array:
+    """Coefficients (degree + 1,) of the polynomial nearest to values at nodes x, lowest power first."""
+    found = Polynomial.fit(x, values, degree, w=weight).convert().coef
+    return np.pad(found, (0, degree + 1 - len(found)))
 
 
 def _albedo_at(sky: Array, cosine: Array) -> Array:

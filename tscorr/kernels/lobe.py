@@ -77,7 +77,7 @@ def set_shape(whole, real):
     return attenuated
 
 
-@njit(**STEP)
+@njit(**BAND)
 def set_amounts(scratch, table, peaks, skip, equations, extras):
     """The reflectance to remove in each band; False, and none of it, if the chunk is out of every lobe.
 
@@ -104,8 +104,8 @@ def set_amounts(scratch, table, peaks, skip, equations, extras):
                 for place in range(peaks):
                     q = present[place]
                     _set_w2(whole, real, np.int32(q), table.w2[q, b])
-                if extras is not None:
-                    _set_factors(scratch, table.w2[:, b], peaks, scattered)
+                if scattered:
+                    _set_factors(whole, real, present[:peaks], table.w2[:, b])
                 _set_exponential(whole, real, power)
                 if scattered:
                     _scale(real, EXPONENTIAL, FACTOR)
@@ -117,8 +117,8 @@ def set_amounts(scratch, table, peaks, skip, equations, extras):
                     q = present[place]
                     _set_lobe(whole, real, np.int32(q), table.fresnel[q, b], table.n[q, b], table.k[q, b])
             else:
-                if extras is not None:
-                    _set_factors(scratch, table.w2[:, b], peaks, scattered)
+                if scattered:
+                    _set_factors(whole, real, present[:peaks], table.w2[:, b])
                 _set_lobe_by_equations(whole, real, aims, table.w[:, b], table.n[:, b], table.k[:, b])
                 if weighted:
                     _scale(real, LOBE, WEIGHT)
@@ -153,14 +153,12 @@ def _set_w2(whole, real, kind, w2):
 
 
 @njit(**STEP)
-def _set_factors(scratch, w2, peaks, scattered):
+def _set_factors(whole, real, kinds, w2):
     """Broaden the lobes of materials whose scattered normals are averaged."""
-    real, whole, present = scratch.real, scratch.whole, scratch.present
-    for place in range(peaks if scattered else 0):
-        _set_w2(whole, real, np.int32(present[place]), w2[present[place]])
-    if scattered:
-        _set_factor(whole, real)
-        _scale(real, W2, FACTOR)
+    for q in kinds:
+        _set_w2(whole, real, np.int32(q), w2[q])
+    _set_factor(whole, real)
+    _scale(real, W2, FACTOR)
 
 
 @njit(**STEP)

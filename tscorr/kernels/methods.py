@@ -11,6 +11,7 @@ from tscorr.kernels.layout import (
     AVERAGED,
     BACK,
     BACK_SKY,
+    BAND,
     BETA_RATE,
     BETA_SIGMA,
     CAST_SHADOW,
@@ -56,18 +57,21 @@ from tscorr.kernels.layout import (
     SUN_UP,
     TAKE,
     TWO,
-    UNSURE,
     WAYS,
     WEIGHT,
     ZERO,
 )
 
 
-@njit(**STEP)
+@njit(**BAND)
 def set_extras(scratch, extras, peaks, row, start, stop):
     """What only some runs have of a chunk; True if all its materials are simply subtracted, without the sky."""
     real, whole, present, plain = scratch.real, scratch.whole, scratch.present, True
-    _set_fields(extras.weight, extras.scatter, row, start, stop, whole, real)
+    if extras.weight.size > 1 or not extras.simple:
+        _set_weight(real, extras.weight, row, start, stop)
+    if not extras.simple:
+        set_scatter(real, extras.scatter, row, start, stop)
+        _clear_rules(whole)
     for place in range(0 if extras.simple else peaks):
         q = present[place]
         method, averaged, has_sky = (
@@ -81,24 +85,37 @@ def set_extras(scratch, extras, peaks, row, start, stop):
 
 
 @njit(**STEP)
-def _set_fields(weight, scatter, row, start, stop, whole, real):
-    """Weights and the variance of the normals of a chunk, each of which may be one for all pixels; no more rules."""
-    sigma = scatter[0, 0] * RAD_PER_DEG
-    for j in range(CHUNK):
-        real[WEIGHT + j] = weight[0, 0]
-        real[SCATTER2 + j] = sigma * sigma
-        whole[UNSURE + j] = 0
-        whole[AVERAGED + j] = 0
-        whole[SKIES + j] = 0
-    if weight.size > 1:
+def _set_weight(real, weight, row, start, stop):
+    """Weights of a chunk."""
+    if weight.size == 1:
+        for j in range(CHUNK):
+            real[WEIGHT + j] = weight[0, 0]
+    else:
         line = weight[row, start:stop]
         for j in range(line.size):
             real[WEIGHT + j] = line[j]
-    if scatter.size > 1:
+
+
+@njit(**STEP)
+def set_scatter(real, scatter, row, start, stop):
+    """Variance of the normals of a chunk along each of two axes. [rad^2]"""
+    if scatter.size == 1:
+        sigma = scatter[0, 0] * RAD_PER_DEG
+        for j in range(CHUNK):
+            real[SCATTER2 + j] = sigma * sigma
+    else:
         line = scatter[row, start:stop]
         for j in range(line.size):
             sigma = line[j] * RAD_PER_DEG
             real[SCATTER2 + j] = sigma * sigma
+
+
+@njit(**STEP)
+def _clear_rules(whole):
+    """No rules of the kind that only some runs have."""
+    for j in range(CHUNK):
+        whole[AVERAGED + j] = 0
+        whole[SKIES + j] = 0
 
 
 @njit(**STEP)
@@ -129,7 +146,7 @@ def assess_shaded(whole, real):
     return total
 
 
-@njit(**STEP)
+@njit(**BAND)
 def weigh_any(scratch, extras, peaks, line, rules, b):
     """`weigh` for any method, and with the sky's part."""
     for place in range(peaks):

@@ -135,9 +135,8 @@ class Extras(NamedTuple):
     covariance: Any
     """(m, bands, 5, 5): of t0, t1, w, n, k"""
     variance: Any
-    """(m, bands, 2 VARIANCE_DEGREE + 5): relative variance of the lobe, for `ratio` of the lobe over t0, from the
-    covariance: c0(x) + c1(x) alpha^2 + c2 alpha^4 with polynomials c0, c1 in x = cos_l * scale + shift; then c2,
-    scale, shift"""
+    """(m, bands, VARIANCE_DEGREE + LEAN_DEGREE + 3): relative variance of the lobe, for `ratio` of the lobe over t0,
+    from the covariance: c + (d - e alpha^2)^2 with polynomials c, d in cos_l, lowest powers first; then e"""
     same_variance: Any
     """bool: w and `variance` are those of the band before"""
     sky: Any
@@ -159,14 +158,14 @@ class Extras(NamedTuple):
     beta_sigma where the variance does not hold it already, `sky_sigma`"""
     cross: Any
     """(m, bands, VARIANCE_DEGREE + 3): relative covariance of the lobe and the one at the reference geometry:
-    c0(x) + c1 alpha^2; then c1, and the relative variance of the latter"""
+    c0 + c1 alpha^2 with a polynomial c0 in cos_l; then c1, and the relative variance of the latter"""
     highest: Any
     """(1,): largest stored value that a correction may reach"""
 
 
 def new_scratch(bands: int, real: type[np.floating[Any]]) -> Scratch:
     """Memory for one thread."""
-    whole, lines = np.zeros(18 * CHUNK, np.int32), np.zeros(38 * CHUNK, real)
+    whole, lines = np.zeros(17 * CHUNK, np.int32), np.zeros(39 * CHUNK, real)
     lines[FACTOR : FACTOR + CHUNK] = 1
     return Scratch(
         aims=np.zeros(9 * CHUNK),
