@@ -13,9 +13,11 @@ import pytest
 from tscorr import reference
 from tscorr.angles import unit_vector
 from tscorr.api import correct
-from tscorr.correction import BlockInputs, Corrector, PixelFlag, ReferenceDirections, Rules, Stored
+from tscorr.correction import BlockInputs, Corrector, PixelFlag, ReferenceDirections, Rules, SpecularState, Stored
 from tscorr.correction.albedo import specular_albedo
 from tscorr.correction.covariance import ORIGINS, covariances, origin, paper_directions, synthetic_covariance
+from tscorr.correction.flags import SPECULAR_STATE_SHIFT
+from tscorr.correction.sigmas import SigmaTally
 from tscorr.correction.sky import SKY_ERROR, sky_polynomial
 from tscorr.materials import PARAMETERS, Material, builtin_materials, material
 
@@ -131,6 +133,29 @@ def test_the_draws_hold_sure_and_unsure_pixels():
     assert np.mean(relative < 0.2) > 0.7
     assert np.mean(flags & PixelFlag.UNCERTAIN != 0) > 0.1
     assert np.median(np.stack([sigma for sigma, *_ in found]) / noise) > 3
+
+
+def test_the_histogram_of_sigma_has_what_was_touched():
+    """Medians of two materials to 5 %; nan, and pixels with nothing to remove, are not in it."""
+    rng = np.random.default_rng(36)
+    shape = 40, 50
+    sigma = (10 ** rng.uniform(-4, -1, (3, *shape))).astype(np.float32)
+    rows, state = rng.integers(1, 3, shape).astype(np.uint8), rng.integers(0, 4, shape)
+    unsure = rng.random(shape) < 0.3
+    sigma[:, rows == 2] *= 10
+    sigma[0, :5] = np.nan
+    sigma[1, 0] = 1e-9
+    tally = SigmaTally(3)
+    tally.add(sigma, (state << SPECULAR_STATE_SHIFT | unsure * PixelFlag.UNCERTAIN).astype(np.uint16), rows)
+    touched = (state == SpecularState.CORRECTED) | (state == SpecularState.UNCORRECTABLE)
+    for row in (1, 2):
+        mine = touched & (rows == row)
+        assert tally.touched[row] == mine.sum()
+        assert tally.uncertain[row] == (mine & unsure).sum()
+        known = sigma[:, mine][np.isfinite(sigma[:, mine])]
+        assert tally.histogram[row].sum() == known.size
+        for share in (0.05, 0.5, 0.95):
+            assert tally.quantile(row, share) == pytest.approx(np.quantile(known, share), rel=0.05)
 
 
 # Parameters: what is known of their errors

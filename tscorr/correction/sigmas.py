@@ -5,13 +5,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tscorr.correction.flags import PixelFlag, SpecularState, specular_state
+from tscorr.kernels.tallies import count_sigmas
 
 Array = NDArray[Any]
 
 BINS_A_DECADE = 50
 LOWEST, DECADES = 1e-6, 7
 """reflectance factor: from LOWEST over so many decades; what lies beyond is in the bins at the ends"""
+INFINITE = 0x7F80
+"""upper half of a float32 that is inf"""
+
+
+def _places() -> Array:
+    """The bin of each upper half of a float32, whose values are alike to 1 %: int32 (65536,); -1 from inf on."""
+    middles = ((np.arange(INFINITE, dtype=np.uint32) << 16) + (1 << 15)).view(np.float32).astype(float)
+    steps = np.log10(np.maximum(middles, LOWEST) / LOWEST) * BINS_A_DECADE
+    places = np.full(1 << 16, -1, np.int32)
+    places[:INFINITE] = np.minimum(steps, DECADES * BINS_A_DECADE - 1)
+    return places
+
+
+PLACES = _places()
 
 
 class SigmaTally:
@@ -27,19 +41,8 @@ class SigmaTally:
         self.touched = np.zeros(materials, np.int64)
 
     def add(self, sigma: Array, flags: Array, rows: Array) -> None:
-        """Add a block: sigma (bands, rows, cols), flags and rows of the corrector (rows, cols)."""
-        state = specular_state(flags)
-        where = np.nonzero((state == SpecularState.CORRECTED) | (state == SpecularState.UNCORRECTABLE))
-        row, count = rows[where].astype(np.int64), len(self.touched)
-        self.touched += np.bincount(row, minlength=count)
-        self.uncertain += np.bincount(row[flags[where] & PixelFlag.UNCERTAIN != 0], minlength=count)
-        bins = self.histogram.shape[1]
-        for band in sigma:
-            values = band[where]
-            known = np.isfinite(values)  # not where uncorrectable pixels are nodata
-            place = np.log10(np.maximum(values[known], LOWEST) / LOWEST) * BINS_A_DECADE
-            at = row[known] * bins + np.minimum(place.astype(np.int64), bins - 1)
-            self.histogram += np.bincount(at, minlength=self.histogram.size).reshape(self.histogram.shape)
+        """Add a block: sigma, float32 (bands, rows, cols), flags and rows of the corrector (rows, cols)."""
+        count_sigmas(sigma.view(np.uint32), flags, rows, PLACES, self.histogram, self.uncertain, self.touched)
 
     @property
     def arrays(self) -> dict[str, Array]:

@@ -7,7 +7,9 @@ from tscorr.kernels.equations import attenuation
 from tscorr.kernels.layout import (
     ALPHA2,
     ASSESS,
+    BLOCK,
     CHUNK,
+    CORRECTED_STATE,
     COS_I,
     COS_L,
     COS_R,
@@ -23,11 +25,14 @@ from tscorr.kernels.layout import (
     SHARE,
     SIMPLIFIED,
     STATE,
+    STATE_SHIFT,
     STEP,
     TEN,
     TILT,
     TILT_BIN,
     TWO_TO_32,
+    UNCERTAIN,
+    UNCORRECTABLE_STATE,
     WAYS,
     ZERO,
 )
@@ -86,3 +91,25 @@ def tally_removed(whole, real, amounts, count, scale, tally):
             g = attenuation(np.float64(real[COS_I + j]), np.float64(real[COS_R + j]), np.float64(real[COS_L + j]))
             change = 1 - g if (whole[WAYS + j] & SIMPLIFIED) != 0 else 1 / g - 1
             tally.attenuated[1] = max(tally.attenuated[1], part * change)
+
+
+@njit(cache=True, **BLOCK)
+def count_sigmas(bits, flags, rows, places, histogram, uncertain, touched):
+    """Add a block to the sums of `SigmaTally`, over the pixels with something to remove.
+
+    bits   : uint32 (bands, rows, cols), the bits of 1 sigma as float32.
+    places : int32 (65536,), the bin of the histogram for the upper half of the bits; below 0: counted nowhere.
+    """
+    for i in range(flags.shape[0]):
+        for j in range(flags.shape[1]):
+            state = (flags[i, j] >> STATE_SHIFT) & 3
+            if (state == CORRECTED_STATE) | (state == UNCORRECTABLE_STATE):
+                touched[rows[i, j]] += 1
+                uncertain[rows[i, j]] += (flags[i, j] & UNCERTAIN) != 0
+        for b in range(bits.shape[0]):
+            line = bits[b, i]
+            for j in range(line.size):
+                state = (flags[i, j] >> STATE_SHIFT) & 3
+                place = places[line[j] >> 16]
+                if ((state == CORRECTED_STATE) | (state == UNCORRECTABLE_STATE)) & (place >= 0):
+                    histogram[rows[i, j], place] += 1

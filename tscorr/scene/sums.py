@@ -34,13 +34,16 @@ class Sums:
         """Add a block of these rows of the corrector; `kind` says why most of its work was skipped, if it was."""
         from tscorr.scene.compiled import count_values
 
-        counts = np.zeros(1 << 16, np.int64)
+        counts, sigmas = np.zeros(1 << 16, np.int64), None
         count_values(result.flags, counts)
+        if result.sigma is not None:
+            sigmas = SigmaTally(len(self.sigmas.touched))
+            sigmas.add(result.sigma, result.flags, rows)
         with self._lock:
             add_tally(self.tally, result.tally)
             self.flags += counts
-            if result.sigma is not None:
-                self.sigmas.add(result.sigma, result.flags, rows)
+            for name, values in ({} if sigmas is None else sigmas.arrays).items():
+                self.sigmas.arrays[name] += values
             self.skipped["blocks"] += 1
             if kind is not None:
                 self.skipped[kind] += 1
