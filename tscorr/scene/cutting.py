@@ -15,10 +15,12 @@ COPIES = 5
 """an image block and what is made of it, at most, in blocks of the image's own size"""
 GEOMETRY_BYTES = 48
 """vectors, angles and masks of a pixel"""
-LAYER_BYTES = {"angles": 48, "azimuthal_width": 48}
+LAYER_BYTES = {"angles": 100, "azimuthal_width": 100}
 """what the layers that are asked for add to that, with what they are made of"""
 SIGMA_BYTES = 10
 """the same of the uncertainty, for each band"""
+COG_MB = 70
+"""what GDAL takes to make one file cloud-optimised"""
 MOST_WORKERS = 4
 
 
@@ -77,6 +79,12 @@ def _room_mb(scene: Scene) -> float:
 def threads_of(scene: Scene) -> int:
     """Threads that the scene has blocks for."""
     return min(workers_of(scene), len(units_of(scene)))
+
+
+def closing_threads(scene: Scene) -> int:
+    """Rasters that are finished at a time, of those that GDAL rewrites no more than the memory limit feeds."""
+    fed = int(_room_mb(scene) / COG_MB) if scene.config.output.format == "cog" else MOST_WORKERS
+    return max(1, min(threads_of(scene), fed))
 
 
 def scene_mb(scene: Scene) -> float:

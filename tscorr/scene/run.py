@@ -15,9 +15,9 @@ from tscorr.correction.edges import ShadowByBrightness
 from tscorr.grid import Block
 from tscorr.scene.angle_layers import AngleLayers
 from tscorr.scene.bad_bands import BadBands
-from tscorr.scene.cutting import threads_of, units_of, workers_of
+from tscorr.scene.cutting import closing_threads, units_of, workers_of
 from tscorr.scene.ground import Ground
-from tscorr.scene.memory import keep_below
+from tscorr.scene.memory import give_back, keep_below
 from tscorr.scene.pictures import Lights
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import write_corrected_vrt, writer_of, written_products
@@ -104,7 +104,9 @@ class Pipeline:
                 for writer in self.writers.values():
                     writer.abandon()
                 raise
-            with self.sums.timed("write"), ThreadPoolExecutor(threads_of(scene)) as pool:
+            if scene.config.output.format == "cog":
+                give_back()  # GDAL takes as much to make them as the blocks took
+            with self.sums.timed("write"), ThreadPoolExecutor(closing_threads(scene)) as pool:
                 self.written = dict(zip(self.writers, pool.map(self._close, self.writers.values()), strict=True))
             if self._as_difference and self._strip is None:
                 write_corrected_vrt(scene, self.folder)
