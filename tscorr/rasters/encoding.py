@@ -1,6 +1,6 @@
 """Blocks as the bytes of tiles: each is encoded where it was computed, so that threads share the work of a codec."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -9,6 +9,7 @@ import rasterio
 from affine import Affine
 from numpy.typing import NDArray
 from rasterio.io import MemoryFile
+from zstandard import ZstdCompressor
 
 from tscorr.rasters import tiff
 
@@ -40,6 +41,8 @@ class Tiles(NamedTuple):
 class Encoder:
     """Encodes blocks of whole tiles for one file.
 
+    ZSTD without GDAL, which takes 1.6 times as long to put together and predict what is to be compressed.
+
     options : creation options of the file. layout : how it is cut. tiled : whether into tiles, not strips.
     """
 
@@ -47,13 +50,17 @@ class Encoder:
         self._options = {key: options[key] for key in SHARED if key in options}
         self._layout = layout
         self._tiled = tiled
-        self._plain = options.get("compress") in {None, "none"}
+        self._codec = options.get("compress") or "none"
 
     @contextmanager
     def __call__(self, values: Array) -> Iterator[Tiles]:
         """The tiles of a block (bands, rows, cols); they last as long as the context."""
-        if self._plain:
-            yield self._copied(values)
+        if self._codec == "none":
+            tiles, sizes = self._arranged(values)
+            yield Tiles(tiff.octets(tiles), np.arange(len(tiles)) * tiles[0].nbytes, sizes)
+            return
+        if self._codec == "zstd":
+            yield self._zstd(values)
             return
         rows, cols = self._padded(values)
         cut: dict[str, Any] = {"tiled": False, "blockysize": min(self._layout.tile[0], rows)}
@@ -78,8 +85,19 @@ class Encoder:
         tile_rows, tile_cols = self._layout.tile
         return -(-rows // tile_rows) * tile_rows, -(-cols // tile_cols) * tile_cols
 
-    def _copied(self, values: Array) -> Tiles:
-        """Tiles without a codec."""
+    def _zstd(self, values: Array) -> Tiles:
+        """Tiles that are predicted and compressed."""
+        predicted = PREDICTORS[self._options.get("predictor", 1)]
+        compressor = ZstdCompressor(level=self._options["zstd_level"])
+        tiles, sizes = self._arranged(values)
+        parts = [
+            compressor.compress(tiff.octets(predicted(tile))[:size])
+            for tile, size in zip(tiles, sizes.tolist(), strict=True)
+        ]
+        return Tiles.joined(parts, np.array([len(part) for part in parts]))
+
+    def _arranged(self, values: Array) -> tuple[Array, Array]:
+        """Tiles (tiles, rows, cols, samples) in the order of the file, and how many bytes of each are stored."""
         tile_rows, tile_cols = self._layout.tile
         rows, cols = self._padded(values)
         bands = values.shape[0]
@@ -97,8 +115,33 @@ class Encoder:
                 for j in range(across):
                     part = values[band, i * tile_rows : (i + 1) * tile_rows, j * tile_cols : (j + 1) * tile_cols]
                     plane[i, j, : part.shape[0], : part.shape[1]] = part
-        size = tile_rows * tile_cols * tiles.itemsize * (bands if by_pixel else 1)
-        sizes = np.full(tiles.size * tiles.itemsize // size, size)
+        tiles = tiles.reshape(-1, tile_rows, tile_cols, bands if by_pixel else 1)
+        sizes = np.full(len(tiles), tiles[0].nbytes)
         if rows % tile_rows:  # strips: the last of a file has only the rows that there are
-            sizes.reshape(-1, down)[:, -1] = size // tile_rows * (rows % tile_rows)
-        return Tiles(tiff.octets(tiles), np.arange(sizes.size) * size, sizes)
+            sizes.reshape(-1, down)[:, -1] = tiles[0].nbytes // tile_rows * (rows % tile_rows)
+        return tiles, sizes
+
+
+def _differences(tile: Array) -> Array:
+    """Predictor 2: each value less its left neighbour's of the same band, modulo the range of the type.
+
+    Source: TIFF 6.0, section 14. Takes and gives (rows, cols, samples).
+    """
+    found = tile.copy()
+    np.subtract(tile[:, 1:], tile[:, :-1], out=found[:, 1:])
+    return found
+
+
+def _differences_of_bytes(tile: Array) -> Array:
+    """Predictor 3: of each row the first bytes of all its numbers, then the second, ..., and differences of all.
+
+    The first byte is the one with the sign. Source: TIFF Technical Note 3, "Floating point predictor". Takes (rows,
+    cols, samples) and gives as many bytes.
+    """
+    rows, cols, samples = tile.shape
+    bytes_of = tile.astype(tile.dtype.newbyteorder(">")).view(np.uint8).reshape(rows, cols * samples, -1)
+    return _differences(np.ascontiguousarray(bytes_of.transpose(0, 2, 1)).reshape(rows, -1, samples))
+
+
+PREDICTORS: dict[int, Callable[[Array], Array]] = {1: np.asarray, 2: _differences, 3: _differences_of_bytes}
+"""tiles (rows, cols, samples) as they are compressed"""
