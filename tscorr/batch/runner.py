@@ -11,6 +11,7 @@ from tscorr.batch.lock import locked
 from tscorr.batch.outcome import BatchResult, SceneProgress, silent_scene
 from tscorr.batch.overview import write_overview
 from tscorr.batch.planning import plan
+from tscorr.scene import memory
 
 log = logging.getLogger("tscorr")
 
@@ -40,6 +41,7 @@ def run(
     if not isinstance(settings, config.Config):
         settings = config.load_config(settings)
     given = {key: value for key, value in (("workers", workers), ("scheduler", scheduler)) if value is not None}
+    memory.share()
     settings = settings.model_copy(update={"run": settings.run.model_copy(update=given)})
     planned = plan(settings, scenes, materials, to_run=True, overwrite=overwrite)
     folder = Path(settings.output.directory)

@@ -1,4 +1,4 @@
-"""The memory of this process: how much it has used, and giving back what it does not use."""
+"""The memory of this process: how much it has used, using it again, and giving back what it does not use."""
 
 import ctypes
 import resource
@@ -10,6 +10,11 @@ HEADROOM_MB = 35
 WORTH_MB = 30
 """growth since the last time for which it is worth the while"""
 
+GLIBC_TRIM_THRESHOLD, GLIBC_MMAP_THRESHOLD, GLIBC_ARENA_MAX = -1, -3, -8
+"""parameters of its mallopt"""
+LARGEST_KEPT_BYTES = 32 << 20
+"""of one array; glibc allows no more"""
+
 _left = {"mb": 0.0}
 """what this process took after it gave something back"""
 
@@ -20,6 +25,22 @@ def peak_rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
+def share() -> None:
+    """Let all threads take their memory from one place, which keeps what they free until `give_back`.
+
+    To be called before they are started. By itself the C library (glibc) has a place for each thread and returns the
+    arrays of each block to the operating system, which clears every page when the next block asks for it again: a
+    tenth of a run, and a third of the memory more.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):  # another C library
+        return
+    mallopt(GLIBC_ARENA_MAX, 1)
+    mallopt(GLIBC_MMAP_THRESHOLD, LARGEST_KEPT_BYTES)
+    mallopt(GLIBC_TRIM_THRESHOLD, 1 << 30)
+
+
 def keep_below(limit_mb: float) -> None:
     """Give back what is free where this process takes nearly as much as it may. [MB]"""
     if rss_mb() > max(limit_mb - HEADROOM_MB, _left["mb"] + WORTH_MB):
@@ -27,7 +48,7 @@ def keep_below(limit_mb: float) -> None:
 
 
 def give_back() -> None:
-    """Return freed memory to the operating system, where the C library (glibc) keeps it for each thread that freed it.
+    """Return freed memory to the operating system, where the C library (glibc) keeps it.
 
     Without this what the blocks of one scene took stays beside what its pictures and the next scene take.
     """

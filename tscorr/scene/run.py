@@ -13,11 +13,11 @@ from tscorr import rasters
 from tscorr.correction import BlockInputs, BlockResult, Corrector, add_angles, class_rows
 from tscorr.correction.edges import ShadowByBrightness
 from tscorr.grid import Block
+from tscorr.scene import memory
 from tscorr.scene.angle_layers import AngleLayers
 from tscorr.scene.bad_bands import BadBands
 from tscorr.scene.cutting import closing_threads, units_of, workers_of
 from tscorr.scene.ground import Ground
-from tscorr.scene.memory import give_back, keep_below
 from tscorr.scene.pictures import Lights
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import write_corrected_vrt, writer_of, written_products
@@ -92,6 +92,7 @@ class Pipeline:
     def run(self, progress: Progress) -> Sums:
         """All blocks, by the workers of the configuration, and their sums; the first error stops the rest."""
         scene = self.scene
+        memory.share()
         with rasters.environment(), ExitStack() as files:
             self.open(files)
             with self.sums.timed("geometry"):
@@ -105,7 +106,7 @@ class Pipeline:
                     writer.abandon()
                 raise
             if scene.config.output.format == "cog":
-                give_back()  # GDAL takes as much to make them as the blocks took
+                memory.give_back()  # GDAL takes as much to make them as the blocks took
             with self.sums.timed("write"), ThreadPoolExecutor(closing_threads(scene)) as pool:
                 self.written = dict(zip(self.writers, pool.map(self._close, self.writers.values()), strict=True))
             if self._as_difference and self._strip is None:
@@ -180,7 +181,7 @@ class Pipeline:
         with self.sums.timed("write"):
             self._write(block, layers, stored)
         self.sums.add(result, rows, SHADOW_OR_NODATA if dark else None if idle is None else idle.reason)
-        keep_below(self.scene.config.run.memory_limit_mb)
+        memory.keep_below(self.scene.config.run.memory_limit_mb)
         return rows.size
 
     @property
