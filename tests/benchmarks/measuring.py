@@ -1,4 +1,4 @@
-"""Times that mean something on a shared machine: interleaved rounds in one process, medians, ratios."""
+"""Times that mean something on a shared machine: interleaved rounds, medians, ratios."""
 
 import gc
 import json
@@ -7,8 +7,11 @@ import statistics
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple
 
 HERE = Path(__file__).parent
 
@@ -27,6 +30,36 @@ class Times:
     @property
     def cpu_s(self):
         return statistics.median(self.cpu)
+
+
+class Spent(NamedTuple):
+    """Wall and CPU seconds of some work, of all threads."""
+
+    wall: float
+    cpu: float
+
+
+def spent(work, *args):
+    """What some work took of this process, or what it says itself that it took elsewhere."""
+    before, start = resource.getrusage(resource.RUSAGE_SELF), time.perf_counter()
+    result = work(*args)
+    wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF)
+    if isinstance(result, Spent):
+        return result
+    return Spent(wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+
+
+class Elsewhere:
+    """Work that is done by a process of its own, which stays the same; only what it does is timed, not its start."""
+
+    def __init__(self, work):
+        self._work = work
+        self._process = None
+
+    def __call__(self, *args):
+        if self._process is None:
+            self._process = ProcessPoolExecutor(1, get_context("spawn"))
+        return self._process.submit(spent, self._work, *args).result()
 
 
 @dataclass(frozen=True)
@@ -53,12 +86,10 @@ def interleaved(cases, rounds):
     for number in range(0 if rounds > 1 else 1, rounds + 1):
         for name, work in cases.items():
             gc.collect()
-            before, start = resource.getrusage(resource.RUSAGE_SELF), time.perf_counter()
-            work()
-            wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF)
+            took = spent(work)
             if number > 0:
-                walls[name].append(wall)
-                cpus[name].append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+                walls[name].append(took.wall)
+                cpus[name].append(took.cpu)
     return {name: Times(tuple(walls[name]), tuple(cpus[name])) for name in cases}
 
 
