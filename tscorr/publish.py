@@ -129,12 +129,12 @@ class Publication:
 
 
 class EarlyHashes:
-    """SHA-256 of the inputs, found by a thread of its own while they are worked on."""
+    """SHA-256 of the inputs, found by threads of their own while they are worked on: as many as `threads`, or two."""
 
-    def __init__(self, paths: Iterable[Path]) -> None:
+    def __init__(self, paths: Iterable[Path], threads: int = 1) -> None:
         self._paths = list(paths)
         self._stop = threading.Event()
-        self._pool = ThreadPoolExecutor(1)
+        self._pool = ThreadPoolExecutor(min(threads, HASHING_THREADS))
         self._hashes = [self._pool.submit(_input_sha256, path, self._stop) for path in self._paths]
 
     def __enter__(self) -> Self:
@@ -161,8 +161,9 @@ def sha256(path: Path, stop: threading.Event | None = None) -> str:
 _KNOWN: dict[tuple[Path, int, int], str] = {}
 """hashes of the inputs of late by path, size and time of change: a surface model serves all scenes of a batch"""
 MOST_KNOWN = 64
-_knowing = threading.Lock()
+_reading: dict[tuple[Path, int, int], threading.Lock] = {}
 """what several scenes share is read by the first of them while the others wait"""
+_knowing = threading.Lock()
 
 
 def _input_sha256(path: Path, stop: threading.Event) -> str:
@@ -170,11 +171,17 @@ def _input_sha256(path: Path, stop: threading.Event) -> str:
     status = path.stat()
     version = path, status.st_size, status.st_mtime_ns
     with _knowing:
-        digest = _KNOWN.pop(version, None) or sha256(path, stop)
-        if not stop.is_set():
-            _KNOWN[version] = digest
+        own = _reading.setdefault(version, threading.Lock())
+    with own:
+        digest = _KNOWN.get(version) or sha256(path, stop)
+        with _knowing:
+            if not stop.is_set():
+                _KNOWN.pop(version, None)
+                _KNOWN[version] = digest  # as the last that was asked for
             while len(_KNOWN) > MOST_KNOWN:
-                del _KNOWN[next(iter(_KNOWN))]
+                oldest = next(iter(_KNOWN))
+                del _KNOWN[oldest]
+                _reading.pop(oldest, None)
     return digest
 
 

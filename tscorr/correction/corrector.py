@@ -51,7 +51,7 @@ class BlockInputs:
 
     def flags(self) -> Array:
         """The bits that are known before the correction: uint16 (rows, cols)."""
-        flags = np.zeros(self.material.shape, np.uint16)
+        flags = None
         for mask, flag in (
             (self.shadowed, PixelFlag.CAST_SHADOW),
             (self.hidden, PixelFlag.NOT_VIEWED),
@@ -59,8 +59,10 @@ class BlockInputs:
             (self.low_confidence, PixelFlag.LOW_CONFIDENCE),
         ):
             if mask is not None:
-                flags |= mask * np.uint16(flag)
-        return flags
+                bits = mask.astype(np.uint16)
+                bits *= np.uint16(flag)
+                flags = bits if flags is None else np.bitwise_or(flags, bits, out=flags)
+        return np.zeros(self.material.shape, np.uint16) if flags is None else flags
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +136,10 @@ class Corrector:
 
     def have_peaks(self, rows: Array) -> Array:
         """Which pixels have a lobe: bool, of the corrector's row of each, uint8 (rows, cols)."""
-        return looked_up(rows, self.peaks.tobytes().ljust(256, b"\0")).view(np.bool_)
+        peaks = self.peaks
+        if peaks[1:].all():
+            return rows != 0  # in a tenth of the time
+        return looked_up(rows, peaks.tobytes().ljust(256, b"\0")).view(np.bool_)
 
     @property
     def is_compiled(self) -> bool:

@@ -27,7 +27,8 @@ class BadBands:
         So they neither count as nodata nor as saturated.
         """
         kept = image[self.bands]
-        image[self.bands] = image[self._stand_in]
+        if self.bands.size:
+            image[self.bands] = image[self._stand_in]
         return kept
 
     def put_back(self, image: Array, kept: Array) -> None:

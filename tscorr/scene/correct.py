@@ -91,7 +91,7 @@ def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
     started = time.perf_counter()
     with (
         closing(scene),
-        publish.EarlyHashes(scene.inputs) as hashes,
+        publish.EarlyHashes(scene.inputs, threads_of(scene)) as hashes,
         publish.Publication(target_of(scene), threads_of(scene)) as publication,
     ):
         pipeline = Pipeline(scene, publication.folder, final=publication.hash_early)

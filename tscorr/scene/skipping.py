@@ -72,8 +72,8 @@ class Skipping:
         if image is not None and not self._has_data(image, needed):
             return Idle(SHADOW_OR_NODATA)
         if self._reach is not None:
-            present = np.flatnonzero(np.bincount(rows.ravel(), minlength=len(self._peaks))[: len(self._peaks)])
-            attenuated = self._reach.attenuated(block, [int(row) for row in present if self._peaks[row]])
+            present = [int(row) for row in np.flatnonzero(self._peaks) if (rows == row).any()]
+            attenuated = self._reach.attenuated(block, present)
             if attenuated is not None:
                 return Idle(OUT_OF_REACH, attenuated)
         return None
