@@ -25,7 +25,7 @@ from city import CELL_M, Lattice, make_city, make_sparse_classes, profile_of, wr
 from measuring import Elsewhere, Ratio, as_json, interleaved, peak_mb, ratio, table
 from rasterio.shutil import copy as copy_raster
 
-from tscorr import batch
+from tscorr import batch, publish
 from tscorr.correction import class_rows
 from tscorr.scene import correct
 from tscorr.scene.run import Pipeline
@@ -39,7 +39,8 @@ MEMORY_MB = 450.0
 
 
 def run(config):
-    """Correct the one scene of a configuration; its report."""
+    """Correct the one scene of a configuration; its report. Its inputs are hashed again, as by a new process."""
+    publish._KNOWN.clear()
     (outcome,) = batch.run(config, overwrite=True).scenes
     assert outcome.state == "done", outcome.error
     return outcome.report
