@@ -162,7 +162,7 @@ _KNOWN: dict[tuple[Path, int, int], str] = {}
 """hashes of the inputs of late by path, size and time of change: a surface model serves all scenes of a batch"""
 MOST_KNOWN = 64
 _reading: dict[tuple[Path, int, int], threading.Lock] = {}
-"""what several scenes share is read by the first of them while the others wait"""
+"""of inputs that are being read: of what several scenes share, by the first of them, while the others wait"""
 _knowing = threading.Lock()
 
 
@@ -172,16 +172,17 @@ def _input_sha256(path: Path, stop: threading.Event) -> str:
     version = path, status.st_size, status.st_mtime_ns
     with _knowing:
         own = _reading.setdefault(version, threading.Lock())
-    with own:
-        digest = _KNOWN.get(version) or sha256(path, stop)
-        with _knowing:
-            if not stop.is_set():
-                _KNOWN.pop(version, None)
-                _KNOWN[version] = digest  # as the last that was asked for
-            while len(_KNOWN) > MOST_KNOWN:
-                oldest = next(iter(_KNOWN))
-                del _KNOWN[oldest]
-                _reading.pop(oldest, None)
+    try:
+        with own:
+            digest = _KNOWN.get(version) or sha256(path, stop)
+            with _knowing:
+                if not stop.is_set():
+                    _KNOWN.pop(version, None)
+                    _KNOWN[version] = digest  # behind those that were asked for before
+                while len(_KNOWN) > MOST_KNOWN:
+                    del _KNOWN[next(iter(_KNOWN))]
+    finally:
+        _reading.pop(version, None)
     return digest
 
 

@@ -41,8 +41,8 @@ def run(
     if not isinstance(settings, config.Config):
         settings = config.load_config(settings)
     given = {key: value for key, value in (("workers", workers), ("scheduler", scheduler)) if value is not None}
-    memory.share()
     settings = settings.model_copy(update={"run": settings.run.model_copy(update=given)})
+    memory.share()
     planned = plan(settings, scenes, materials, to_run=True, overwrite=overwrite)
     folder = Path(settings.output.directory)
     with locked(folder), _log_file(folder):

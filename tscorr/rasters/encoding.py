@@ -41,7 +41,7 @@ class Tiles(NamedTuple):
 class Encoder:
     """Encodes blocks of whole tiles for one file.
 
-    ZSTD without GDAL, which takes 1.6 times as long to put together and predict what is to be compressed.
+    ZSTD without GDAL, which takes 1.6 times as long for a block, since it copies it four times.
 
     options : creation options of the file. layout : how it is cut. tiled : whether into tiles, not strips.
     """

@@ -28,9 +28,9 @@ def peak_rss_mb() -> float:
 def share() -> None:
     """Let all threads take their memory from one place, which keeps what they free until `give_back`.
 
-    To be called before they are started. By itself the C library (glibc) has a place for each thread and returns the
-    arrays of each block to the operating system, which clears every page when the next block asks for it again: a
-    tenth of a run, and a third of the memory more.
+    To be called before they are started; it holds for the whole process. By itself the C library (glibc) has a place
+    for each thread, and returns the arrays of each block to the operating system, which clears every page of them when
+    the next block asks again: that takes a tenth of a run.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
