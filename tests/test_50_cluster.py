@@ -257,7 +257,8 @@ def test_a_worker_that_cannot_see_an_input_says_so_before_work(cluster, inputs, 
 
 def test_a_worker_that_comes_later_says_so_too(cluster, inputs, monkeypatch):
     monkeypatch.setattr(tasks, "stamp", moved)
-    monkeypatch.setattr(driver, "_check_workers", lambda *_: None)
+    turns = tasks.OneSceneAtATime()  # without them, which are all that is left of the check, no worker starts
+    monkeypatch.setattr(driver, "_check_workers", lambda client, _: client.register_plugin(turns))
     result = batch.run(config_of(inputs, "late"), scheduler=cluster.scheduler_address)
     assert result.exit_code == 3
     assert f"on {socket.gethostname()} cannot see the input" in result.scenes[0].error
