@@ -127,7 +127,8 @@ def _differences(tile: Array) -> Array:
 
     Source: TIFF 6.0, section 14. Takes and gives (rows, cols, samples).
     """
-    found = tile.copy()
+    found = np.empty_like(tile)
+    found[:, 0] = tile[:, 0]
     np.subtract(tile[:, 1:], tile[:, :-1], out=found[:, 1:])
     return found
 
