@@ -14,6 +14,12 @@ import pytest
 from tscorr import publish
 from tscorr.errors import InputError, OutputError
 
+ABC = {
+    "blake3": "6437b3ac38465133ffb63b75273a8db548c558465d79db03fd359c6cd5bd9d85",
+    "sha256": "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad",
+}
+"""hashes of the letters abc, as published with the algorithms"""
+
 
 def published(target, content="new", key="k"):
     """A published folder with two files."""
@@ -29,19 +35,23 @@ def leftovers(folder):
     return [path.name for path in folder.iterdir() if path.name.startswith(".")]
 
 
-def test_a_committed_folder_has_its_files_and_a_manifest_of_their_hashes(tmp_path):
-    target = published(tmp_path / "out" / "scene")
+@pytest.mark.parametrize("algorithm", ABC)
+def test_a_committed_folder_has_its_files_and_a_manifest_of_their_hashes(tmp_path, algorithm):
+    target = tmp_path / "out" / "scene"
+    with publish.Publication(target, algorithm=algorithm) as publication:
+        (publication.folder / "a.txt").write_text("abc")
+        publication.commit({"key": "k"})
     manifest = json.loads((target / "manifest.json").read_text())
     assert manifest["key"] == "k"
-    assert manifest["outputs"] == {
-        "a.txt": {"sha256": hashlib.sha256(b"new").hexdigest(), "bytes": 3},
-        "b.txt": {"sha256": hashlib.sha256(b"b").hexdigest(), "bytes": 1},
-    }
+    assert manifest["outputs"] == {"a.txt": {algorithm: ABC[algorithm], "bytes": 3}}
     assert leftovers(tmp_path / "out") == []
+    assert publish.damaged(target) == []
+    (target / "a.txt").write_text("abd")
+    assert publish.damaged(target) == [f"{target / 'a.txt'} has changed since it was published"]
 
 
 def test_files_that_are_hashed_early_have_the_same_entries(tmp_path):
-    with publish.Publication(tmp_path / "out") as publication:
+    with publish.Publication(tmp_path / "out", algorithm="sha256") as publication:
         (publication.folder / "a.txt").write_bytes(b"a" * 3_000_000)
         publication.hash_early(publication.folder / "a.txt")
         (publication.folder / "b.txt").write_bytes(b"b")
@@ -56,7 +66,7 @@ def test_inputs_are_hashed_beside_other_work(tmp_path):
     paths = [tmp_path / name for name in "ab"]
     for path in paths:
         path.write_bytes(path.name.encode() * 3_000_000)
-    with publish.EarlyHashes(paths) as hashes:
+    with publish.EarlyHashes(paths, algorithm="sha256") as hashes:
         assert hashes.entries() == {
             str(path): {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in paths
         }

@@ -1,5 +1,6 @@
 """scene: from files to files, against the ray-traced truth of Delft and against geometry done by hand."""
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -357,6 +358,15 @@ def test_a_scene_folder_holds_what_the_design_promises(tmp_path):
     assert set(manifest["outputs"]) == names - {"manifest.json"}
     inputs = {str(tmp_path / name) for name in ("image.tif", "class_map.tif", "dsm.tif")}
     assert set(manifest["inputs"]) == inputs
+
+
+def test_a_manifest_holds_sha_256_where_that_is_asked_for(tmp_path):
+    config = small_scene(tmp_path, output={"directory": "out", "hash": "sha256", "quicklook": False})
+    folder = run(config).folder
+    manifest = json.loads((folder / "manifest.json").read_text())
+    for place, entries in ((folder, manifest["outputs"]), (tmp_path, manifest["inputs"])):
+        for name, entry in entries.items():
+            assert entry["sha256"] == hashlib.sha256((place / name).read_bytes()).hexdigest()
 
 
 def test_the_angles_are_those_of_the_facets(tmp_path):

@@ -27,18 +27,18 @@ def many(tmp_path_factory):
     batch.run(write_scenes(few, 2, side=SIDE))
     overhead_of_few = measured(write_scenes(few, FEW, side=SIDE))[3]
     hashed, compared = Counter(), []
-    whole, difference = publish.sha256, overlap.difference
+    whole, difference = publish.digest, overlap.difference
 
-    def sha256(path, stop=None):
+    def digest(path, algorithm, stop=None):
         hashed[path.name] += 1
-        return whole(path, stop)
+        return whole(path, algorithm, stop)
 
     def noted(one, two, region):
         compared.append((one[0].name, two[0].name))
         return difference(one, two, region)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(publish, "sha256", sha256)
+        patch.setattr(publish, "digest", digest)
         patch.setattr(overlap, "difference", noted)
         result, footprint, _, overhead = measured(write_scenes(folder, MANY, side=SIDE))
     return folder, result, footprint, overhead / overhead_of_few, hashed, compared

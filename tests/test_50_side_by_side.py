@@ -117,12 +117,12 @@ def test_an_error_of_one_scene_leaves_those_beside_it_alone(tmp_path, monkeypatc
 
 def test_what_scenes_share_is_hashed_once_though_they_start_together(tmp_path, monkeypatch):
     config = small_scene(tmp_path, *SCENES, run={"workers": 4})
-    hashed, whole = [], batch.runner.publish.sha256
+    hashed, whole = [], batch.runner.publish.digest
 
-    def sha256(path, stop=None):
+    def digest(path, algorithm, stop=None):
         hashed.append(path.name)
-        return whole(path, stop)
+        return whole(path, algorithm, stop)
 
-    monkeypatch.setattr(batch.runner.publish, "sha256", sha256)
+    monkeypatch.setattr(batch.runner.publish, "digest", digest)
     batch.run(config)
     assert hashed.count("dsm.tif") == 1

@@ -79,7 +79,7 @@ def unpublished():
     """A run that neither hashes nor checks nor flushes what it wrote."""
     with ExitStack() as patches:
         for name, value in (
-            ("tscorr.publish.sha256", lambda *_: ""),
+            ("tscorr.publish.digest", lambda *_: ""),
             ("tscorr.publish.os.fsync", lambda _: None),
             ("tscorr.rasters.writing.checksum", lambda _: 0),
             ("tscorr.rasters.writing.read_at", lambda *_: b""),

@@ -33,7 +33,7 @@ COUNTED = (
     (correct, "page", "report_s"),
     (correct, "draw_quicklook", "report_s"),
     (pictures, "_light", "report_s"),  # in threads of its own
-    (publish, "sha256", "work_s"),
+    (publish, "digest", "work_s"),
     (Pipeline, "_close", "work_s"),  # reads what was written, in threads of its own
 )
 """functions whose time is no overhead, and what it counts as"""

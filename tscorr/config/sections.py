@@ -52,6 +52,7 @@ class Output(Section):
         "file", description="vrt: only what was removed is written, and a small file that subtracts it from the image"
     )
     quicklook: bool = Field(True, description="draw a true-colour picture: before, after, flags")
+    hash: Literal["blake3", "sha256"] = Field("blake3", description="of inputs and outputs, in manifest.json")
 
 
 class Model(Section):

@@ -88,11 +88,11 @@ def target_of(scene: Scene) -> Path:
 
 def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
     """Correct a scene and publish its folder; the content of its report.json."""
-    started = time.perf_counter()
+    started, algorithm = time.perf_counter(), scene.config.output.hash
     with (
         closing(scene),
-        publish.EarlyHashes(scene.inputs, threads_of(scene)) as hashes,
-        publish.Publication(target_of(scene), threads_of(scene)) as publication,
+        publish.EarlyHashes(scene.inputs, threads_of(scene), algorithm) as hashes,
+        publish.Publication(target_of(scene), threads_of(scene), algorithm) as publication,
     ):
         pipeline = Pipeline(scene, publication.folder, final=publication.hash_early)
         sums, lights, written = pipeline.run(progress), pipeline.lights, pipeline.written

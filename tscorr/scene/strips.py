@@ -127,12 +127,12 @@ def correct_strip(strips: Strips, number: int, progress: Progress = silent) -> N
 
 def join(strips: Strips, wall_s: float) -> dict[str, Any]:
     """Publish the scene's folder out of its strips; the content of its report.json."""
-    scene = strips.scene
+    scene, algorithm = strips.scene, strips.scene.config.output.hash
     parts = [strips.part(number) for number in range(len(strips.blocks))]
     with (
         closing(scene),
-        publish.EarlyHashes(scene.inputs) as hashes,
-        publish.Publication(target_of(scene)) as publication,
+        publish.EarlyHashes(scene.inputs, algorithm=algorithm) as hashes,
+        publish.Publication(target_of(scene), algorithm=algorithm) as publication,
     ):
         sums = Sums(len(scene.materials), scene.image.bands)
         for part in parts:
