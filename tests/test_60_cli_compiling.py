@@ -4,17 +4,22 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from numba import njit
-from small_scene import small_scene
+from numba.core.event import RecordingListener, install_listener
+from small_scene import SHAPE, small_scene, write_raster
 
 import tscorr
+from tscorr import batch
 from tscorr.cli import cli
 from tscorr.cli.common import COMPILING, compilation_told
+from tscorr.correction import ahead
 from tscorr.kernels import correct_block
 from tscorr.kernels.stamp import SOURCES, sources_of
 
@@ -82,6 +87,55 @@ def test_a_second_run_compiles_nothing(tmp_path):
     result = subprocess.run(again, capture_output=True, text=True, check=True)
     assert result.stderr == ""
     assert "results: " in result.stdout
+
+
+FIRST = """
+import sys
+from tscorr import batch
+from tscorr.kernels import correct_block
+assert batch.run(sys.argv[1]).scenes[0].state == "done"
+print(sum(correct_block.stats.cache_misses.values()), sum(correct_block.stats.cache_hits.values()))
+"""
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_a_first_run_has_the_kernel_compiled_by_another_process(tmp_path, given):
+    """And finds it in the cache: types that differ anywhere, as those of given normals do, would be compiled here."""
+    normals = write_raster(tmp_path / "normals.tif", np.broadcast_to(np.eye(3)[2, :, None, None], (3, *SHAPE)))
+    surface = {"kind": "normals", "path": str(normals), "heights": "dsm.tif"}
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(PACKAGE.parent)}
+    config = str(small_scene(tmp_path, {"surface": surface} if given else {}, run={"workers": 2}))
+    command = [sys.executable, "-c", FIRST, config]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert result.stdout == "0 1\n"
+
+
+@pytest.mark.parametrize("program", ["a program that is not there", "false"])
+def test_where_no_other_process_compiles_this_one_does(tmp_path, monkeypatch, program):
+    monkeypatch.setattr(ahead, "_is_new", lambda: True)
+    monkeypatch.setattr(ahead, "another", lambda _: {"args": [program]})
+    scene = batch.run(small_scene(tmp_path, run={"workers": 2})).scenes[0]
+    assert scene.state == "done", scene.error
+
+
+def test_a_process_that_compiles_ends_with_the_run(monkeypatch):
+    """Here one that takes long, of a run that fails meanwhile."""
+    monkeypatch.setattr(ahead, "_is_new", lambda: True)
+    monkeypatch.setattr(ahead, "another", lambda _: {"args": ["sleep", "100"]})
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match="at once"), ahead.compiling([()]):
+        raise ValueError("at once")
+    assert time.perf_counter() - start < 5
+
+
+def test_a_wait_for_the_other_process_is_told(monkeypatch):
+    monkeypatch.setattr(ahead, "_is_new", lambda: True)
+    monkeypatch.setattr(ahead, "another", lambda _: {"args": ["sleep", "0.2"]})
+    with install_listener("numba:compile", RecordingListener()) as heard, ahead.compiling([()]) as until_compiled:
+        until_compiled()
+        assert len(heard.buffer) == 2
+        until_compiled()
+        assert len(heard.buffer) == 2
 
 
 ENTRY = """

@@ -5,7 +5,6 @@ and a second. A process that answers and ends keeps them away from the images, a
 """
 
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -14,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tscorr.interpreter import another
 
 Array = NDArray[np.float64]
 
@@ -43,9 +44,8 @@ def eye() -> Eye:
 @cache
 def _asked() -> Eye:
     """The tables, from another interpreter that finds the same packages; from this one where it has no other."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path or os.curdir for path in sys.path)}
     try:
-        answer = subprocess.run([sys.executable, "-m", "tscorr.eye"], env=environment, capture_output=True, check=True)
+        answer = subprocess.run(**another("tscorr.eye"), capture_output=True, check=True)
         return Eye(*map(np.array, json.loads(answer.stdout)))
     except (OSError, subprocess.CalledProcessError, ValueError):
         with np.printoptions():  # the package changes how numpy prints arrays, for everyone

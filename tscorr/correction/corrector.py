@@ -1,6 +1,7 @@
 """A block in, a block without its specular part out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from tscorr import kernels
 from tscorr.correction import oracle
+from tscorr.correction.ahead import compiling
 from tscorr.correction.extras import extras_table, is_extra, signed
 from tscorr.correction.flags import PixelFlag
 from tscorr.correction.rules import Stored
@@ -121,6 +123,7 @@ class Corrector:
         self.removed_type = signed(stored.dtype, materials)
         self._asked = uncertainty or weighted or any(is_extra(rules) for *_, rules in materials)
         self._pixels = pixel_rules(stored)
+        self._until_compiled: Callable[[], object] = lambda: None
         precisions = [computed_precision(parameters, rules) for _, parameters, rules in materials]
         self._engines = [
             self._engine(precision, np.array([False, *(own == precision for own in precisions)]), materials, stored)
@@ -150,6 +153,15 @@ class Corrector:
     def peaks(self) -> Array:
         """Which rows have a lobe to remove: bool (materials + 1,); row 0, no material, has none."""
         return np.logical_or.reduce([engine.table.peak for engine in self._engines])
+
+    @contextmanager
+    def compiled_ahead(self, inputs: BlockInputs) -> Iterator[None]:
+        """Within this context another process compiles, if need be, what blocks like this one need."""
+        results = self._results(inputs, everywhere=inputs.image.shape, want_removed=False)
+        compiled = (engine for engine in self._engines if engine.precision != "reference")
+        calls = [self._arguments(engine, inputs, results, 0) for engine in compiled]
+        with compiling(calls) as self._until_compiled:
+            yield
 
     def passed_through(self, inputs: BlockInputs) -> BlockResult:
         """The block as it is where it is known that nothing of it is to be removed; directions are not looked at.
@@ -205,6 +217,15 @@ class Corrector:
         results.tally.states[0] = 0, 0, 0, np.count_nonzero(inputs.material == 0)
 
     def _run(self, engine: _Engine, inputs: BlockInputs, results: "_Results", first_row: int) -> None:
+        arguments = self._arguments(engine, inputs, results, first_row)
+        if engine.precision == "reference":
+            oracle.correct_block(*arguments)
+        else:
+            self._until_compiled()
+            kernels.correct_block(*arguments)
+
+    def _arguments(self, engine: _Engine, inputs: BlockInputs, results: "_Results", first_row: int) -> tuple[Any, ...]:
+        """Of the engine's `correct_block`."""
         real = np.float32 if engine.precision == "fast" else np.float64
         block = (
             inputs.image,
@@ -221,11 +242,10 @@ class Corrector:
         options = np.array([self.skip, first_row, self.tally_stride], dtype=np.int64)
         extras = None if engine.extras is None else _of_block(engine.extras, inputs, results.sigma)
         if engine.precision == "reference":
-            oracle.correct_block(*block, options, extras)
-        else:
-            scratch = kernels.new_scratch(len(inputs.image), real)
-            equations = True if engine.precision == "exact" else None
-            kernels.correct_block(*block, scratch, equations, options, extras)
+            return *block, options, extras
+        scratch = kernels.new_scratch(len(inputs.image), real)
+        equations = True if engine.precision == "exact" else None
+        return *block, scratch, equations, options, extras
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ there is a number that f_spec does not exceed. What a block out of reach is flag
 pixel lit, seen and not too steep, and G below 1 in all of them or in none, since the report counts them.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -75,22 +76,21 @@ class Reach:
         fan = scene.view.fan(scene.grid)
         return None if fan is None else cls(scene, fan, surface.height_m)
 
-    def attenuated(self, block: Block, rows: list[int]) -> bool | None:
+    def attenuated(self, block: Block, rows: Iterable[int]) -> bool | None:
         """Whether G is below 1 in a block out of reach of the materials of these rows; None where it may be reached.
 
-        rows : of the corrector, from 1.
+        rows : of the corrector, from 1; no more of them are asked for than up to the first that may be reached.
         """
         sun, view = self._cones(block)
         if np.isnan(view.spread_deg).any():
             return None
         zenith_i, zenith_r = sun.zenith_deg, view.zenith_deg
-        if not all(self._assessed(row, zenith_i, zenith_r) for row in rows):
-            return None
         phi = relative_azimuth(zenith_azimuth(view.axis)[1], zenith_azimuth(sun.axis)[1])
         turn = sun.azimuth_spread_deg + view.azimuth_spread_deg
         phis = np.maximum(phi - turn, 0), np.minimum(phi + turn, 180)
-        if any(self._may_reach(row, zenith_i, zenith_r, phis) for row in rows):
-            return None
+        for row in rows:
+            if not self._assessed(row, zenith_i, zenith_r) or self._may_reach(row, zenith_i, zenith_r, phis):
+                return None
         return _attenuated(sun, view)
 
     def _cones(self, block: Block) -> tuple[Cones, Cones]:

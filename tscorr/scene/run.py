@@ -95,6 +95,8 @@ class Pipeline:
         memory.share()
         with rasters.environment(), ExitStack() as files:
             self.open(files)
+            if workers_of(scene) > 1:
+                files.enter_context(self.corrector.compiled_ahead(self._one_pixel()))
             with self.sums.timed("geometry"):
                 self._prepare()
             self.writers = {name: writer_of(scene, self.folder, name, self._strip) for name in sorted(self._products)}
@@ -239,6 +241,11 @@ class Pipeline:
                 add_angles(result.tally, tally)
         return result
 
+    def _one_pixel(self) -> BlockInputs:
+        """A block of the least size, of the types of all."""
+        image = np.zeros((self.scene.image.bands, 1, 1), self.scene.image.dtype)
+        return self._without_geometry(Block(0, 0, 1, 1), image, np.zeros((1, 1), np.uint8))
+
     def _without_geometry(self, block: Block, image: Array, rows: Array) -> BlockInputs:
         up = np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1)
         return BlockInputs(
@@ -246,7 +253,7 @@ class Pipeline:
             material=rows,
             sun=up,
             view=up,
-            normal=up.astype(np.float32),  # as normals of surfaces are: nothing more is compiled
+            normal=up.astype(self.ground.surface.normal_type),  # nothing more is compiled
             low_confidence=_doubtful(self._class_confidence(block)),
         )
 

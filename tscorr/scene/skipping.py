@@ -72,7 +72,7 @@ class Skipping:
         if image is not None and not self._has_data(image, needed):
             return Idle(SHADOW_OR_NODATA)
         if self._reach is not None:
-            present = [int(row) for row in np.flatnonzero(self._peaks) if (rows == row).any()]
+            present = (int(row) for row in np.flatnonzero(self._peaks) if (rows == row).any())
             attenuated = self._reach.attenuated(block, present)
             if attenuated is not None:
                 return Idle(OUT_OF_REACH, attenuated)

@@ -1,0 +1,66 @@
+"""The kernel compiled by another process, while this one compiles the geometry and begins with it.
+
+numba compiles one function at a time in a process, and the kernel is half of what a first run compiles. The two
+processes meet in numba's cache on the disk. Where the other one fails, this one compiles, as it would have anyway.
+"""
+
+import gc
+import pickle
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tscorr import kernels
+from tscorr.interpreter import another
+
+
+@contextmanager
+def compiling(calls: Sequence[tuple[Any, ...]]) -> Iterator[Callable[[], object]]:
+    """Have `correct_block` compiled for the types of some arguments; what comes back waits until it is.
+
+    That is nothing where it was compiled before, for whatever types. Leaving the context ends the other process.
+    """
+    process = _compiler(calls) if calls and _is_new() else None
+    if process is None:
+        yield lambda: None
+        return
+    try:
+        yield lambda: _wait(process)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _is_new() -> bool:
+    """Whether no run has compiled the kernel here."""
+    stats = getattr(kernels.correct_block, "stats", None)  # plain Python has none, where numba is switched off
+    return stats is not None and not any(Path(stats.cache_path).glob("*.correct_block-*.nbi"))
+
+
+def _compiler(calls: Sequence[tuple[Any, ...]]) -> "subprocess.Popen[bytes] | None":
+    with tempfile.TemporaryFile() as content:
+        pickle.dump(calls, content)
+        content.seek(0)
+        nobody = subprocess.DEVNULL
+        try:
+            return subprocess.Popen(**another("tscorr.correction.ahead"), stdin=content, stdout=nobody, stderr=nobody)
+        except OSError:
+            return None
+
+
+def _wait(process: "subprocess.Popen[bytes]") -> None:
+    from numba.core.event import trigger_event
+
+    if process.poll() is None:
+        with trigger_event("numba:compile", data={"dispatcher": kernels.correct_block}):  # who listens, hears of it
+            process.wait()
+
+
+if __name__ == "__main__":
+    gc.disable()  # it would search the many objects of numba again and again, and this process does not last
+    for arguments in pickle.load(sys.stdin.buffer):  # noqa: S301 - of the process that started this one
+        kernels.correct_block(*arguments)
