@@ -118,7 +118,8 @@ class Layout:
         for plane, i, j in np.ndindex(shape):
             window = np.s_[i * tile_rows : (i + 1) * tile_rows, j * tile_cols : (j + 1) * tile_cols]
             tile = values[plane, *window] if self.planes > 1 else values[:, *window]
-            found[plane, i, j] = tile.max() != 0 or tile.min() != 0  # a fraction of the time of tile.any()
+            # Some rows mostly tell; and the largest and the least take a fraction of the time of tile.any().
+            found[plane, i, j] = any(rows.max() != 0 or rows.min() != 0 for rows in (tile[..., ::16, :], tile))
         return found
 
 

@@ -245,13 +245,17 @@ class Layer:
 
 
 def _fitting_predictor(options: dict[str, Any], layer: Layer) -> dict[str, Any]:
-    """Creation options that suit the type: predictor 3 is for floating point, 2 for integers, none for bits."""
+    """Creation options that suit the type: predictor 3 is for floating point, 2 for integers, none for bits.
+
+    Nor for integers that are mostly 0: the others need no more bytes by themselves than as differences, and no work.
+    """
     options = dict(options)
     compressed = options.get("compress") in {"deflate", "lzw", "zstd"}
-    if not compressed or layer.bits or options.get("predictor", 1) == 1:
+    integers = np.dtype(layer.dtype).kind in "iu"
+    if not compressed or layer.bits or (layer.sparse and integers) or options.get("predictor", 1) == 1:
         options.pop("predictor", None)
     else:
-        options["predictor"] = 2 if np.dtype(layer.dtype).kind in "iu" else 3
+        options["predictor"] = 2 if integers else 3
     if options.get("compress") == "zstd":
         options["zstd_level"] = ZSTD_LEVEL
     return options

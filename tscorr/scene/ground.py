@@ -79,6 +79,12 @@ class Ground:
         return self._heights.read(block, 1)
 
     @property
+    def normal_type(self) -> type[np.floating[Any]]:
+        """Of the surface's normals, of which nothing need be read."""
+        found_here = isinstance(self._scene.settings.surface, config.FlatSettings | config.DsmSettings)
+        return np.float32 if found_here else np.float64
+
+    @property
     def surface(self) -> Surface:
         """The surface; its heights are surveyed when it is first asked for."""
         with self._lock:

@@ -253,7 +253,7 @@ class Pipeline:
             material=rows,
             sun=up,
             view=up,
-            normal=up.astype(self.ground.surface.normal_type),  # nothing more is compiled
+            normal=up.astype(self.ground.normal_type),  # nothing more is compiled
             low_confidence=_doubtful(self._class_confidence(block)),
         )
 

@@ -32,9 +32,6 @@ class Relief(NamedTuple):
 class Surface(Protocol):
     """Heights and normals of blocks of a scene."""
 
-    normal_type: type[np.floating[Any]] = np.float32
-    """of the normals"""
-
     def relief(self, block: Block, wanted: Array | None = None) -> Relief:
         """Heights and normals at once.
 
@@ -188,8 +185,6 @@ class RoofPlaneSurface(Surface):
 
 class GivenNormals(Surface):
     """Normals from a raster (3, rows, cols), and heights from another or constant."""
-
-    normal_type = np.float64
 
     def __init__(self, read: Read, surface: Surface) -> None:
         self._read = read
