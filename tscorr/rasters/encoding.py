@@ -86,63 +86,79 @@ class Encoder:
         return -(-rows // tile_rows) * tile_rows, -(-cols // tile_cols) * tile_cols
 
     def _zstd(self, values: Array) -> Tiles:
-        """Tiles that are predicted and compressed."""
-        predicted = PREDICTORS[self._options.get("predictor", 1)]
+        """Tiles that are predicted and compressed, each at once, as long as the processor has it at hand."""
+        put = PREDICTED[self._options.get("predictor", 1)]
         compressor = ZstdCompressor(level=self._options["zstd_level"])
-        tiles, sizes = self._arranged(values)
-        parts = [
-            compressor.compress(tiff.octets(predicted(tile))[:size])
-            for tile, size in zip(tiles, sizes.tolist(), strict=True)
-        ]
+        tile, parts = self._empty(values, 1)[0], []
+        for plane, (top, left), stored in self._cut(values):
+            if plane.shape[1] - top < tile.shape[0] or plane.shape[2] - left < tile.shape[1]:
+                tile[:] = 0
+            parts.append(compressor.compress(tiff.octets(put(plane, top, left, tile))[:stored]))
         return Tiles.joined(parts, np.array([len(part) for part in parts]))
 
     def _arranged(self, values: Array) -> tuple[Array, Array]:
         """Tiles (tiles, rows, cols, samples) in the order of the file, and how many bytes of each are stored."""
-        tile_rows, tile_cols = self._layout.tile
+        cut = list(self._cut(values))
+        tiles = self._empty(values, len(cut))
+        for tile, (plane, (top, left), _) in zip(tiles, cut, strict=True):
+            _lay(plane, top, left, tile)
+        return tiles, np.array([stored for *_, stored in cut])
+
+    def _empty(self, values: Array, count: int) -> Array:
+        """Tiles (tiles, rows, cols, samples) for a block; zeros where it does not fill all of them."""
         rows, cols = self._padded(values)
-        bands = values.shape[0]
-        tile_rows, across = min(tile_rows, rows), cols // tile_cols
-        down = -(-rows // tile_rows)
-        by_pixel = self._layout.planes == 1
-        shape = (
-            (1, down, across, tile_rows, tile_cols, bands) if by_pixel else (bands, down, across, tile_rows, tile_cols)
-        )
-        whole = values.shape[1:] == (down * tile_rows, cols)
-        tiles = (np.empty if whole else np.zeros)(shape, values.dtype)
-        for band in range(bands):
-            plane = tiles[0, ..., band] if by_pixel else tiles[band]
-            for i in range(down):
-                for j in range(across):
-                    part = values[band, i * tile_rows : (i + 1) * tile_rows, j * tile_cols : (j + 1) * tile_cols]
-                    plane[i, j, : part.shape[0], : part.shape[1]] = part
-        tiles = tiles.reshape(-1, tile_rows, tile_cols, bands if by_pixel else 1)
-        sizes = np.full(len(tiles), tiles[0].nbytes)
-        if rows % tile_rows:  # strips: the last of a file has only the rows that there are
-            sizes.reshape(-1, down)[:, -1] = tiles[0].nbytes // tile_rows * (rows % tile_rows)
-        return tiles, sizes
+        shape = min(self._layout.tile[0], rows), self._layout.tile[1], len(values) if self._layout.planes == 1 else 1
+        return (np.empty if values.shape[1:] == (rows, cols) else np.zeros)((count, *shape), values.dtype)
+
+    def _cut(self, values: Array) -> Iterator[tuple[Array, tuple[int, int], int]]:
+        """The tiles of a block in the order of the file.
+
+        Of each the values (samples, rows, cols) that it is cut from, row and column of its first pixel there, and how
+        many bytes of it are stored: of strips the last of a file has only the rows that there are.
+        """
+        tile_rows, tile_cols = self._layout.tile
+        for plane in (values,) if self._layout.planes == 1 else values[:, np.newaxis]:
+            for top in range(0, values.shape[1], tile_rows):
+                rows = tile_rows if self._tiled else min(tile_rows, values.shape[1] - top)
+                for left in range(0, values.shape[2], tile_cols):
+                    yield plane, (top, left), rows * tile_cols * len(plane) * values.itemsize
 
 
-def _differences(tile: Array) -> Array:
-    """Predictor 2: each value less its left neighbour's of the same band, modulo the range of the type.
+def _lay(values: Array, top: int, left: int, tile: Array) -> Array:
+    """The values (samples, rows, cols) from a pixel on in their places of a tile (rows, cols, samples)."""
+    rows, cols, samples = tile.shape
+    for sample in range(samples):
+        part = values[sample, top : top + rows, left : left + cols]
+        tile[: part.shape[0], : part.shape[1], sample] = part
+    return tile
 
-    Source: TIFF 6.0, section 14. Takes and gives (rows, cols, samples).
+
+def _put_differences(values: Array, top: int, left: int, tile: Array) -> Array:
+    """Predictor 2 of a tile (`set_differences`)."""
+    from tscorr.rasters.compiled import set_differences
+
+    unsigned = np.dtype(f"u{values.itemsize}")
+    set_differences(np.ascontiguousarray(values).view(unsigned), top, left, tile.view(unsigned))
+    return tile
+
+
+def _put_differences_of_bytes(values: Array, top: int, left: int, tile: Array) -> Array:
+    """Predictor 3: of each row the first bytes of all its numbers, then the second, ..., and differences of all.
+
+    The first byte is the one with the sign. Source: TIFF Technical Note 3, "Floating point predictor".
     """
-    found = np.empty_like(tile)
-    found[:, 0] = tile[:, 0]
-    np.subtract(tile[:, 1:], tile[:, :-1], out=found[:, 1:])
+    rows, cols, samples = _lay(values, top, left, tile).shape
+    octets = tile.astype(tile.dtype.newbyteorder(">")).view(np.uint8).reshape(rows, cols * samples, -1)
+    sorted_octets = np.ascontiguousarray(octets.transpose(0, 2, 1)).reshape(rows, -1, samples)
+    found = np.empty_like(sorted_octets)
+    found[:, 0] = sorted_octets[:, 0]
+    np.subtract(sorted_octets[:, 1:], sorted_octets[:, :-1], out=found[:, 1:])
     return found
 
 
-def _differences_of_bytes(tile: Array) -> Array:
-    """Predictor 3: of each row the first bytes of all its numbers, then the second, ..., and differences of all.
-
-    The first byte is the one with the sign. Source: TIFF Technical Note 3, "Floating point predictor". Takes (rows,
-    cols, samples) and gives as many bytes.
-    """
-    rows, cols, samples = tile.shape
-    bytes_of = tile.astype(tile.dtype.newbyteorder(">")).view(np.uint8).reshape(rows, cols * samples, -1)
-    return _differences(np.ascontiguousarray(bytes_of.transpose(0, 2, 1)).reshape(rows, -1, samples))
-
-
-PREDICTORS: dict[int, Callable[[Array], Array]] = {1: np.asarray, 2: _differences, 3: _differences_of_bytes}
-"""tiles (rows, cols, samples) as they are compressed"""
+PREDICTED: dict[int, Callable[[Array, int, int, Array], Array]] = {
+    1: _lay,
+    2: _put_differences,
+    3: _put_differences_of_bytes,
+}
+"""values (samples, rows, cols) from a pixel on, as what is compressed of a tile (rows, cols, samples)"""
