@@ -195,8 +195,8 @@ def image_reads(monkeypatch):
     ("nodata", "scene", "units"),
     [
         (None, {}, 1),
-        (-1, {}, 4),
-        (None, {"saturation": 9000}, 4),
+        (-1, {}, 10),
+        (None, {"saturation": 9000}, 10),
         (None, STEEP, 0),
     ],
     ids=["integers", "nodata", "saturation", "out of reach"],
@@ -217,7 +217,7 @@ def test_the_image_is_read_only_where_it_must_be(tmp_path, monkeypatch, nodata, 
     pixels = image_reads(monkeypatch)
     folder, report = run(config)
     assert len(pixels) == units
-    assert report["skipped"]["blocks"] == 4
+    assert report["skipped"]["blocks"] == 10
     file, _ = run(
         write_config(tmp_path, scene, output=output | {"directory": "f", "corrected": "file"}, materials=materials)
     )

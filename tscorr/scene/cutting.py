@@ -7,7 +7,8 @@ from tscorr.grid import Block, blocks
 from tscorr.scene.pictures import lights_mb
 from tscorr.scene.plan import Scene
 
-UNIT_COLUMNS = 2048
+UNIT_COLUMNS = 512
+"""wider blocks are fewer, and leave the processor's cache between one step and the next"""
 STRIPE_COLUMNS = 6144
 BASE_MB = 340
 """memory of the process before the first block, and of what does not grow with blocks nor differ between scenes"""
