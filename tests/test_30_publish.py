@@ -50,6 +50,13 @@ def test_a_committed_folder_has_its_files_and_a_manifest_of_their_hashes(tmp_pat
     assert publish.damaged(target) == [f"{target / 'a.txt'} has changed since it was published"]
 
 
+def test_a_file_whose_hash_nobody_here_knows_is_not_called_whole(tmp_path, monkeypatch):
+    target = published(tmp_path / "scene")
+    monkeypatch.setattr(publish, "HASHES", {"sha256": hashlib.sha256})
+    problems = publish.damaged(target)
+    assert problems[0] == f"{target / 'a.txt'} has no hash that this version of tscorr knows: blake3, bytes"
+
+
 def test_files_that_are_hashed_early_have_the_same_entries(tmp_path):
     with publish.Publication(tmp_path / "out", algorithm="sha256") as publication:
         (publication.folder / "a.txt").write_bytes(b"a" * 3_000_000)

@@ -128,6 +128,32 @@ def test_a_process_that_compiles_ends_with_the_run(monkeypatch):
     assert time.perf_counter() - start < 5
 
 
+def test_scenes_side_by_side_wait_for_one_process(monkeypatch):
+    started = []
+
+    def one(_):
+        started.append(1)
+        return {"args": ["sleep", "0.3"]}
+
+    monkeypatch.setattr(ahead, "_is_new", lambda: True)
+    monkeypatch.setattr(ahead, "another", one)
+    with ahead.compiling([()]) as first, ahead.compiling([()]) as second:
+        start = time.perf_counter()
+        second()
+        assert time.perf_counter() - start > 0.1
+        first()
+    assert started == [1]
+    assert not ahead._at_work
+
+
+def test_without_a_place_for_the_types_nothing_is_compiled_ahead(tmp_path, monkeypatch):
+    monkeypatch.setattr(ahead, "_is_new", lambda: True)
+    monkeypatch.setattr(ahead.tempfile, "tempdir", str(tmp_path / "nowhere"))
+    with ahead.compiling([()]) as until_compiled:
+        until_compiled()
+        assert not ahead._at_work
+
+
 def test_a_wait_for_the_other_process_is_told(monkeypatch):
     monkeypatch.setattr(ahead, "_is_new", lambda: True)
     monkeypatch.setattr(ahead, "another", lambda _: {"args": ["sleep", "0.2"]})

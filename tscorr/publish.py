@@ -257,10 +257,12 @@ def damaged(target: Path) -> list[str]:
         path = target / name
         if not path.is_file():
             problems.append(f"{path} is missing")
-        elif any(digest(path, name) != entry[name] for name in HASHES if name in entry):
+        elif not (known := [algorithm for algorithm in HASHES if algorithm in entry]):
+            problems.append(f"{path} has no hash that this version of tscorr knows: {', '.join(entry)}")
+        elif any(digest(path, algorithm) != entry[algorithm] for algorithm in known):
             problems.append(f"{path} has changed since it was published")
-    known = {MANIFEST, *manifest["outputs"]}
-    problems += [f"{path} was not published" for path in sorted(target.iterdir()) if path.name not in known]
+    expected = {MANIFEST, *manifest["outputs"]}
+    problems += [f"{path} was not published" for path in sorted(target.iterdir()) if path.name not in expected]
     return problems
 
 

@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,45 +18,53 @@ from typing import Any
 from tscorr import kernels
 from tscorr.interpreter import another
 
+_at_work: "list[subprocess.Popen[bytes]]" = []
+"""the process that compiles, if one does: scenes that are done side by side wait for the same"""
+_starting = threading.Lock()
+
 
 @contextmanager
-def compiling(calls: Sequence[tuple[Any, ...]]) -> Iterator[Callable[[], object]]:
+def compiling(calls: Sequence[tuple[Any, ...]]) -> Iterator[Callable[[], None]]:
     """Have `correct_block` compiled for the types of some arguments; what comes back waits until it is.
 
-    That is nothing where it was compiled before, for whatever types. Leaving the context ends the other process.
+    That is nothing where this cache has had a kernel, of whatever types. Leaving the context ends the process that it
+    started; who waits for it then goes on.
     """
-    process = _compiler(calls) if calls and _is_new() else None
-    if process is None:
-        yield lambda: None
-        return
+    with _starting:
+        own = _compiler(calls) if calls and not _at_work and _is_new() else None
+        if own is not None:
+            _at_work.append(own)
+        process = next(iter(_at_work), None)
     try:
         yield lambda: _wait(process)
     finally:
-        process.kill()
-        process.wait()
+        if own is not None:
+            own.kill()
+            own.wait()
+            _at_work.remove(own)
 
 
 def _is_new() -> bool:
-    """Whether no run has compiled the kernel here."""
+    """Whether the cache has never had a kernel."""
     stats = getattr(kernels.correct_block, "stats", None)  # plain Python has none, where numba is switched off
     return stats is not None and not any(Path(stats.cache_path).glob("*.correct_block-*.nbi"))
 
 
 def _compiler(calls: Sequence[tuple[Any, ...]]) -> "subprocess.Popen[bytes] | None":
-    with tempfile.TemporaryFile() as content:
-        pickle.dump(calls, content)
-        content.seek(0)
-        nobody = subprocess.DEVNULL
-        try:
+    nobody = subprocess.DEVNULL
+    try:
+        with tempfile.TemporaryFile() as content:
+            pickle.dump(calls, content)
+            content.seek(0)
             return subprocess.Popen(**another("tscorr.correction.ahead"), stdin=content, stdout=nobody, stderr=nobody)
-        except OSError:
-            return None
+    except OSError:
+        return None
 
 
-def _wait(process: "subprocess.Popen[bytes]") -> None:
+def _wait(process: "subprocess.Popen[bytes] | None") -> None:
     from numba.core.event import trigger_event
 
-    if process.poll() is None:
+    if process is not None and process.poll() is None:
         with trigger_event("numba:compile", data={"dispatcher": kernels.correct_block}):  # who listens, hears of it
             process.wait()
 

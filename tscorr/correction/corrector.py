@@ -123,7 +123,7 @@ class Corrector:
         self.removed_type = signed(stored.dtype, materials)
         self._asked = uncertainty or weighted or any(is_extra(rules) for *_, rules in materials)
         self._pixels = pixel_rules(stored)
-        self._until_compiled: Callable[[], object] = lambda: None
+        self._until_compiled: Callable[[], None] = lambda: None
         precisions = [computed_precision(parameters, rules) for _, parameters, rules in materials]
         self._engines = [
             self._engine(precision, np.array([False, *(own == precision for own in precisions)]), materials, stored)

@@ -46,7 +46,7 @@ def settings_of(scene: Scene) -> dict[str, Any]:
 
 
 def resume_key(scene: Scene) -> str:
-    """Digest of all that a scene's values depend on: settings, inputs, materials and version, not the machine.
+    """Digest of all that a scene's folder depends on: settings, inputs, materials and version, not the machine.
 
     Which of the products were written is not in it: the manifest lists them.
     """

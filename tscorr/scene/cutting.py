@@ -9,6 +9,8 @@ from tscorr.scene.plan import Scene
 
 UNIT_COLUMNS = 512
 """wider blocks are fewer, and leave the processor's cache between one step and the next"""
+WHOLE_LINES_COLUMNS = 2048
+"""the same where whole lines of the image are read, whatever is wanted of them"""
 STRIPE_COLUMNS = 6144
 BASE_MB = 340
 """memory of the process before the first block, and of what does not grow with blocks nor differ between scenes"""
@@ -48,7 +50,8 @@ def units_of(scene: Scene, strip: Block | None = None, workers: int | None = Non
     rows, cols = image.shape
     tile_rows, tile_cols = image.written_tile
     room = _room_mb(scene) * 1e6 / (workers or workers_of(scene)) / work_bytes(scene)  # pixels
-    widest = cols if tile_cols >= cols else max(1, UNIT_COLUMNS // tile_cols) * tile_cols
+    unit_cols = UNIT_COLUMNS if scene.image.pixel_by_pixel is None else WHOLE_LINES_COLUMNS
+    widest = cols if tile_cols >= cols else max(1, unit_cols // tile_cols) * tile_cols
     width = min(widest, max(1, int(room / tile_rows / tile_cols)) * tile_cols)
     height = max(1, min(int(room / min(width, cols)), 512) // tile_rows) * tile_rows
     stripe = max(width, STRIPE_COLUMNS // width * width)
