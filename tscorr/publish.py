@@ -26,7 +26,6 @@ SEALED = ',\n "manifest_sha256": "'
 """stands before the hash that ends a manifest"""
 HASHES: dict[str, Callable[[], Any]] = {"blake3": blake3, "sha256": hashlib.sha256}
 """of files, by the name that stands in the manifest; BLAKE3 takes a third of the time of SHA-256"""
-HASHING_THREADS = 2
 READ_BYTES = 1 << 20
 HIDDEN = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>part|old)")
 """names of what is being made and of what is being replaced"""
@@ -83,8 +82,8 @@ class Publication:
         self.target = target
         self._algorithm = algorithm
         self.folder = hidden_name(target, "part")
-        self._threads = min(threads, HASHING_THREADS)
-        self._hasher = ThreadPoolExecutor(self._threads)
+        self._threads = threads
+        self._hasher = ThreadPoolExecutor(1)
         self._hashes: dict[Path, Future[str]] = {}
 
     def __enter__(self) -> Self:
@@ -136,15 +135,15 @@ class Publication:
 
 
 class EarlyHashes:
-    """Hashes of the inputs, found by threads of their own while they are worked on: as many as `threads`, or two.
+    """Hashes of the inputs, found by a thread of its own while they are worked on.
 
     algorithm : one of HASHES.
     """
 
-    def __init__(self, paths: Iterable[Path], threads: int = 1, algorithm: str = "blake3") -> None:
+    def __init__(self, paths: Iterable[Path], algorithm: str = "blake3") -> None:
         self._paths, self._algorithm = list(paths), algorithm
         self._stop = threading.Event()
-        self._pool = ThreadPoolExecutor(min(threads, HASHING_THREADS))
+        self._pool = ThreadPoolExecutor(1)
         self._hashes = [self._pool.submit(_digest_of_input, path, algorithm, self._stop) for path in self._paths]
 
     def __enter__(self) -> Self:

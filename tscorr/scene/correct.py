@@ -91,7 +91,7 @@ def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
     started, algorithm = time.perf_counter(), scene.config.output.hash
     with (
         closing(scene),
-        publish.EarlyHashes(scene.inputs, threads_of(scene), algorithm) as hashes,
+        publish.EarlyHashes(scene.inputs, algorithm) as hashes,
         publish.Publication(target_of(scene), threads_of(scene), algorithm) as publication,
     ):
         pipeline = Pipeline(scene, publication.folder, final=publication.hash_early)

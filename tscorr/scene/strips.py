@@ -131,7 +131,7 @@ def join(strips: Strips, wall_s: float) -> dict[str, Any]:
     parts = [strips.part(number) for number in range(len(strips.blocks))]
     with (
         closing(scene),
-        publish.EarlyHashes(scene.inputs, algorithm=algorithm) as hashes,
+        publish.EarlyHashes(scene.inputs, algorithm) as hashes,
         publish.Publication(target_of(scene), algorithm=algorithm) as publication,
     ):
         sums = Sums(len(scene.materials), scene.image.bands)
