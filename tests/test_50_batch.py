@@ -279,9 +279,12 @@ ended = threading.Event()
 
 def watch():
     global most
-    me = threading.get_native_id()
+    me, known = threading.get_native_id(), set()
     while not ended.wait(0.002):
-        most = max(most, sum(state == "R" for task, state, _ in states() if task not in (me, mine)))
+        running = [task for task, state, _ in states() if state == "R" and task not in (me, mine)]
+        alive = {thread.native_id for thread in threading.enumerate()}
+        known |= alive  # of those who are no longer, the system may still have to put one away
+        most = max(most, sum(task in alive or task not in known for task in running))
 
 watcher = threading.Thread(target=watch)
 watcher.start()
