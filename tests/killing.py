@@ -63,7 +63,7 @@ def start(config, log, before=None):
         cli(["run", "-q", str(config)], prog_name="tscorr")
     except SystemExit as end:
         code = end.code
-    except BaseException:
+    except BaseException:  # noqa: BLE001 - which the exit below would swallow
         traceback.print_exc()
     finally:
         sys.stdout.flush()
