@@ -22,6 +22,7 @@ from tscorr.cli.common import COMPILING, compilation_told
 from tscorr.correction import ahead
 from tscorr.kernels import correct_block
 from tscorr.kernels.stamp import SOURCES, sources_of
+from tscorr.scene.run import Pipeline
 
 PACKAGE = Path(tscorr.__file__).parent
 COUNT = """
@@ -123,7 +124,7 @@ def test_a_process_that_compiles_ends_with_the_run(monkeypatch):
     monkeypatch.setattr(ahead, "_is_new", lambda: True)
     monkeypatch.setattr(ahead, "another", lambda _: {"args": ["sleep", "100"]})
     start = time.perf_counter()
-    with pytest.raises(ValueError, match="at once"), ahead.compiling([()]):
+    with pytest.raises(ValueError, match="at once"), ahead.compiling(lambda: [()]):
         raise ValueError("at once")
     assert time.perf_counter() - start < 5
 
@@ -137,7 +138,7 @@ def test_scenes_side_by_side_wait_for_one_process(monkeypatch):
 
     monkeypatch.setattr(ahead, "_is_new", lambda: True)
     monkeypatch.setattr(ahead, "another", one)
-    with ahead.compiling([()]) as first, ahead.compiling([()]) as second:
+    with ahead.compiling(lambda: [()]) as first, ahead.compiling(lambda: [()]) as second:
         start = time.perf_counter()
         second()
         assert time.perf_counter() - start > 0.1
@@ -149,15 +150,26 @@ def test_scenes_side_by_side_wait_for_one_process(monkeypatch):
 def test_without_a_place_for_the_types_nothing_is_compiled_ahead(tmp_path, monkeypatch):
     monkeypatch.setattr(ahead, "_is_new", lambda: True)
     monkeypatch.setattr(ahead.tempfile, "tempdir", str(tmp_path / "nowhere"))
-    with ahead.compiling([()]) as until_compiled:
+    with ahead.compiling(lambda: [()]) as until_compiled:
         until_compiled()
         assert not ahead._at_work
+
+
+def test_where_the_kernel_is_compiled_no_scene_makes_a_sample(tmp_path, monkeypatch):
+    """It would take a block to be made, and a pixel to be read, for each of many scenes."""
+    monkeypatch.setattr(ahead, "_is_new", lambda: False)
+    monkeypatch.setattr(Pipeline, "_one_pixel", lambda _: pytest.fail("made"))
+    scene = batch.run(small_scene(tmp_path, run={"workers": 2})).scenes[0]
+    assert scene.state == "done", scene.error
 
 
 def test_a_wait_for_the_other_process_is_told(monkeypatch):
     monkeypatch.setattr(ahead, "_is_new", lambda: True)
     monkeypatch.setattr(ahead, "another", lambda _: {"args": ["sleep", "0.2"]})
-    with install_listener("numba:compile", RecordingListener()) as heard, ahead.compiling([()]) as until_compiled:
+    with (
+        install_listener("numba:compile", RecordingListener()) as heard,
+        ahead.compiling(lambda: [()]) as until_compiled,
+    ):
         until_compiled()
         assert len(heard.buffer) == 2
         until_compiled()

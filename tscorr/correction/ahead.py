@@ -24,14 +24,14 @@ _starting = threading.Lock()
 
 
 @contextmanager
-def compiling(calls: Sequence[tuple[Any, ...]]) -> Iterator[Callable[[], None]]:
-    """Have `correct_block` compiled for the types of some arguments; what comes back waits until it is.
+def compiling(calls: Callable[[], Sequence[tuple[Any, ...]]]) -> Iterator[Callable[[], None]]:
+    """Have `correct_block` compiled for the types of the arguments of some calls; what comes back waits until it is.
 
-    That is nothing where this cache has had a kernel, of whatever types. Leaving the context ends the process that it
-    started; who waits for it then goes on.
+    That is nothing where this cache has had a kernel, of whatever types: then the calls are not even asked for.
+    Leaving the context ends the process that it started; who waits for it then goes on.
     """
     with _starting:
-        own = _compiler(calls) if calls and not _at_work and _is_new() else None
+        own = _compiler(calls()) if not _at_work and _is_new() else None
         if own is not None:
             _at_work.append(own)
         process = next(iter(_at_work), None)
@@ -51,6 +51,8 @@ def _is_new() -> bool:
 
 
 def _compiler(calls: Sequence[tuple[Any, ...]]) -> "subprocess.Popen[bytes] | None":
+    if not calls:
+        return None
     nobody = subprocess.DEVNULL
     try:
         with tempfile.TemporaryFile() as content:

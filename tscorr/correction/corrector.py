@@ -155,11 +155,15 @@ class Corrector:
         return np.logical_or.reduce([engine.table.peak for engine in self._engines])
 
     @contextmanager
-    def compiled_ahead(self, inputs: BlockInputs) -> Iterator[None]:
-        """Within this context another process compiles, if need be, what blocks like this one need."""
-        results = self._results(inputs, everywhere=inputs.image.shape, want_removed=False)
-        compiled = (engine for engine in self._engines if engine.precision != "reference")
-        calls = [self._arguments(engine, inputs, results, 0) for engine in compiled]
+    def compiled_ahead(self, sample: Callable[[], BlockInputs]) -> Iterator[None]:
+        """Within this context another process compiles, if need be, what blocks like the sample need."""
+
+        def calls() -> list[tuple[Any, ...]]:
+            inputs = sample()
+            results = self._results(inputs, everywhere=inputs.image.shape, want_removed=False)
+            compiled = (engine for engine in self._engines if engine.precision != "reference")
+            return [self._arguments(engine, inputs, results, 0) for engine in compiled]
+
         with compiling(calls) as self._until_compiled:
             yield
 

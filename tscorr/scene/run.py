@@ -96,7 +96,7 @@ class Pipeline:
         with rasters.environment(), ExitStack() as files:
             self.open(files)
             if workers_of(scene) > 1:
-                files.enter_context(self.corrector.compiled_ahead(self._one_pixel()))
+                files.enter_context(self.corrector.compiled_ahead(self._one_pixel))
             with self.sums.timed("geometry"):
                 self._prepare()
             self.writers = {name: writer_of(scene, self.folder, name, self._strip) for name in sorted(self._products)}
