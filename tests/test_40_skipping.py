@@ -5,6 +5,7 @@ import pytest
 import rasterio
 from small_scene import (
     BANDS,
+    CELL,
     GROUND,
     METAL,
     NODATA,
@@ -103,6 +104,20 @@ def test_flat_ground_out_of_reach_is_skipped_and_nothing_changes(tmp_path, view,
 def test_what_is_not_certain_is_computed(tmp_path, scene):
     write_inputs(tmp_path)
     assert with_and_without(tmp_path, {**STEEP, **scene}, **METAL_ONLY)["blocks_out_of_reach"] == 0
+
+
+@pytest.mark.parametrize("glare_px", [0, 2000, 3100, 3584])
+def test_of_a_wide_scene_the_blocks_out_of_reach_are_skipped(tmp_path, glare_px):
+    """The last block is one pixel wide; the camera mirrors the sun at the column that is named."""
+    shape = 16, 3585
+    rng = np.random.default_rng(5)
+    write_image(tmp_path / "image.tif", rng.integers(3000, 6000, (BANDS, *shape)).astype(np.int16))
+    write_raster(tmp_path / "class_map.tif", np.full(shape, METAL, np.uint8))
+    position = [WEST + CELL * glare_px, NORTH + 800 * np.tan(np.deg2rad(50)), 800.0]
+    scene = {**STEEP, "view": {"kind": "frame", "position": position}}
+    skipped = with_and_without(tmp_path, scene, **METAL_ONLY)
+    assert skipped["blocks"] == 8
+    assert 2 <= skipped["blocks_out_of_reach"] <= 6
 
 
 def test_beyond_the_ends_of_a_line_nothing_is_taken_for_seen(tmp_path):

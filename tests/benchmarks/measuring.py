@@ -57,9 +57,16 @@ class Elsewhere:
         self._process = None
 
     def __call__(self, *args):
+        return self._submit(spent, self._work, *args)
+
+    def untimed(self, *args, **kwargs):
+        """What the work returns."""
+        return self._submit(self._work, *args, **kwargs)
+
+    def _submit(self, *args, **kwargs):
         if self._process is None:
             self._process = ProcessPoolExecutor(1, get_context("spawn"))
-        return self._process.submit(spent, self._work, *args).result()
+        return self._process.submit(*args, **kwargs).result()
 
 
 @dataclass(frozen=True)

@@ -290,7 +290,11 @@ def class_rows(classes: Array, rows: Mapping[int, int]) -> Array:
     if classes.dtype.kind not in "iu":
         raise InputError(f"a class map holds {classes.dtype} values; allowed are integers")
     if classes.dtype == np.uint8:
-        return looked_up(classes, bytes(rows.get(value, 0) for value in range(256)))
+        table = bytearray(256)
+        for value, row in rows.items():
+            if 0 <= value < len(table):
+                table[value] = row
+        return looked_up(classes, bytes(table))
     result = np.zeros(classes.shape, np.uint8)
     for value, row in rows.items():
         result[classes == value] = row

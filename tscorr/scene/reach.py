@@ -5,8 +5,10 @@ there is a number that f_spec does not exceed. What a block out of reach is flag
 pixel lit, seen and not too steep, and G below 1 in all of them or in none, since the report counts them.
 """
 
+import threading
+from collections import OrderedDict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +25,9 @@ from tscorr.width import f_spec_bound
 Array = NDArray[Any]
 
 PATCH_PX = 64
+REGION_COLUMNS = 48 * PATCH_PX
+"""half of a stripe of blocks, and little enough memory for hundreds of bands"""
+KEPT_REGIONS = 8
 ROUNDING_DEG = 1e-3
 """more than directions and cosines of the correction err by"""
 ROUNDING = 1e-4
@@ -32,8 +37,8 @@ ROUNDING = 1e-4
 class Cones(NamedTuple):
     """Directions that lie within an angle of an axis.
 
-    axis       : unit vectors (3, patches).
-    spread_deg : (patches,).
+    axis       : unit vectors (3, rows, cols) of patches.
+    spread_deg : (rows, cols).
     """
 
     axis: Array
@@ -41,13 +46,13 @@ class Cones(NamedTuple):
 
     @property
     def zenith_deg(self) -> tuple[Array, Array]:
-        """Lowest and highest zenith angle, each (patches,)."""
+        """Lowest and highest zenith angle, each (rows, cols)."""
         zenith, _ = zenith_azimuth(self.axis)
         return np.maximum(zenith - self.spread_deg, 0), zenith + self.spread_deg
 
     @property
     def azimuth_spread_deg(self) -> Array:
-        """Largest difference of azimuth from that of the axis; 180 where the zenith lies within. (patches,)"""
+        """Largest difference of azimuth from that of the axis; 180 where the zenith lies within. (rows, cols)"""
         zenith, _ = zenith_azimuth(self.axis)
         inside = self.spread_deg >= zenith
         sine = np.sin(np.deg2rad(self.spread_deg)) / np.where(inside, 1, np.sin(np.deg2rad(zenith)))
@@ -56,11 +61,13 @@ class Cones(NamedTuple):
 
 @dataclass(frozen=True)
 class Reach:
-    """What of a scene of level ground the lobes can reach."""
+    """What of a scene of level ground the lobes can reach; any thread may ask."""
 
     scene: Scene
     fan: Fan
     height_m: float
+    _regions: "OrderedDict[Block, Region]" = field(default_factory=OrderedDict, repr=False, compare=False)
+    _lock: Any = field(default_factory=threading.Lock, repr=False, compare=False)
 
     @classmethod
     def of(cls, scene: Scene) -> "Reach | None":
@@ -81,20 +88,31 @@ class Reach:
 
         rows : of the corrector, from 1; no more of them are asked for than up to the first that may be reached.
         """
-        sun, view = self._cones(block)
-        if np.isnan(view.spread_deg).any():
-            return None
-        zenith_i, zenith_r = sun.zenith_deg, view.zenith_deg
-        phi = relative_azimuth(zenith_azimuth(view.axis)[1], zenith_azimuth(sun.axis)[1])
-        turn = sun.azimuth_spread_deg + view.azimuth_spread_deg
-        phis = np.maximum(phi - turn, 0), np.minimum(phi + turn, 180)
-        for row in rows:
-            if not self._assessed(row, zenith_i, zenith_r) or self._may_reach(row, zenith_i, zenith_r, phis):
+        with self._lock:
+            region = self._region(block)
+            patches = region.patches(block)
+            if region.unknown[:, patches].any():
                 return None
-        return _attenuated(sun, view)
+            for row in rows:
+                if row not in region.reached:
+                    region.reached[row] = self._reached(region, row)
+                if region.reached[row][:, patches].any():
+                    return None
+        return next((state for state, certain in region.attenuated.items() if certain[:, patches].all()), None)
+
+    def _region(self, block: Block) -> "Region":
+        """The region that holds a block; the last ones are kept."""
+        first = block.col // REGION_COLUMNS * REGION_COLUMNS
+        last = min(-(-(block.col + block.width) // REGION_COLUMNS) * REGION_COLUMNS, self.scene.grid.shape[1])
+        place = Block(block.row, first, block.height, last - first)
+        region = self._regions.pop(place, None) or Region(place, *self._cones(place))
+        self._regions[place] = region
+        if len(self._regions) > KEPT_REGIONS:
+            self._regions.popitem(last=False)
+        return region
 
     def _cones(self, block: Block) -> tuple[Cones, Cones]:
-        """Sun and view of the patches of a block."""
+        """Sun and view of the patches of a block, (rows, cols) of them."""
         edges = [
             np.append(np.arange(first, first + size - 1, PATCH_PX), first + size - 1)
             if size > 1
@@ -102,43 +120,66 @@ class Reach:
             for first, size in ((block.row, block.height), (block.col, block.width))
         ]
         (top, left), (bottom, right) = (
-            np.meshgrid(edges[0][part], edges[1][part]) for part in (np.s_[:-1], np.s_[1:])
+            np.meshgrid(edges[0][part], edges[1][part], indexing="ij") for part in (np.s_[:-1], np.s_[1:])
         )
         corner_rows, corner_cols = np.stack([top, top, bottom, bottom]), np.stack([left, right, right, left])
         x, y = self.scene.grid.xy(corner_rows.reshape(4, -1), corner_cols.reshape(4, -1))
         vectors, off_deg = self.fan(x, y, self.height_m)
+        vectors, off_deg = vectors.reshape(3, *corner_rows.shape), off_deg.reshape(top.shape)
         vectors = vectors / np.sqrt((vectors**2).sum(axis=0))
         axis = vectors.sum(axis=1)
         axis = axis / np.sqrt((axis**2).sum(axis=0))
         spread = angle_between(vectors, axis[:, None]).max(axis=0) + off_deg + ROUNDING_DEG
         of_sun = np.full(spread.shape, self.scene.sun.spread_deg + ROUNDING_DEG)
-        return Cones(np.broadcast_to(self.scene.sun.center[:, None], axis.shape), of_sun), Cones(axis, spread)
+        center = self.scene.sun.center.reshape(3, 1, 1)
+        return Cones(np.broadcast_to(center, axis.shape), of_sun), Cones(axis, spread)
 
-    def _assessed(self, row: int, *zeniths: tuple[Array, Array]) -> bool:
-        """Whether incidence and exitance are certainly within what a material allows."""
-        surface, _, rules = self.scene.materials[row - 1]
+    def _reached(self, region: "Region", row: int) -> Array:
+        """The patches that a material may reach, or in which it may not be assessed: bool."""
+        surface, parameters, rules = self.scene.materials[row - 1]
         low, high = surface.zenith_range_deg[0], steepest_deg(surface, rules)
-        steep = max(float(highest.max()) for _, highest in zeniths) >= high - ROUNDING_DEG
-        level = low > 0 and np.cos(min(np.deg2rad(lowest).min() for lowest, _ in zeniths)) > np.cos(
-            np.deg2rad(low)
-        ) * (1 - ROUNDING)
-        return not (steep or level)
-
-    def _may_reach(
-        self, row: int, zenith_i: tuple[Array, Array], zenith_r: tuple[Array, Array], phi: tuple[Array, Array]
-    ) -> bool:
-        """Whether a material may have as much as its threshold to remove in any patch and band."""
-        _, parameters, rules = self.scene.materials[row - 1]
+        reached = np.maximum(region.zenith_i[1], region.zenith_r[1]) >= high - ROUNDING_DEG
+        if low > 0:
+            lowest = np.minimum(region.zenith_i[0], region.zenith_r[0])
+            reached = reached | (np.cos(np.deg2rad(lowest)) > np.cos(np.deg2rad(low)) * (1 - ROUNDING))
         gain = np.pi * np.asarray(rules.direct_fraction) * parameters.t1
         bands = np.unique(np.stack([gain, parameters.w, parameters.n, parameters.k]), axis=1)
-        gain, w, n, k = bands[..., None]
-        bound = f_spec_bound(zenith_i, zenith_r, phi, w, n, k, simplified=rules.form == "simplified")
+        gain, w, n, k = bands[..., None, None]
+        bound = f_spec_bound(
+            region.zenith_i, region.zenith_r, region.phi, w, n, k, simplified=rules.form == "simplified"
+        )
         bound = np.where(gain > 0, gain * bound, 0)  # and not 0 times inf
-        return bool(np.any(bound >= rules.negligible_reflectance * (1 - ROUNDING)))
+        return reached | np.any(bound >= rules.negligible_reflectance * (1 - ROUNDING), axis=0)
 
 
-def _attenuated(sun: Cones, view: Cones) -> bool | None:
-    """Whether G is below 1 in all patches (True) or in none (False); None where that is not certain.
+class Region:
+    """An area of patches, for which the bound is worked out at once: alone most of its time would go into overhead.
+
+    All arrays are of patches, (rows, cols).
+    """
+
+    def __init__(self, place: Block, sun: Cones, view: Cones) -> None:
+        self._place = place
+        self.unknown = np.isnan(view.spread_deg)
+        self.zenith_i, self.zenith_r = sun.zenith_deg, view.zenith_deg
+        """lowest and highest of each"""
+        phi = relative_azimuth(zenith_azimuth(view.axis)[1], zenith_azimuth(sun.axis)[1])
+        turn = sun.azimuth_spread_deg + view.azimuth_spread_deg
+        self.phi = np.maximum(phi - turn, 0), np.minimum(phi + turn, 180)
+        """lowest and highest relative azimuth"""
+        self.attenuated = _attenuated(sun, view)
+        """where G is certainly 1 (False), and where it certainly is less (True)"""
+        self.reached: dict[int, Array] = {}
+        """by row of the corrector"""
+
+    def patches(self, block: Block) -> slice:
+        """The columns of patches that a block is covered by."""
+        first, last = block.col - self._place.col, block.col + block.width - 1 - self._place.col
+        return slice(min(first // PATCH_PX, self.unknown.shape[1] - 1), last // PATCH_PX + 1)
+
+
+def _attenuated(sun: Cones, view: Cones) -> dict[bool, Array]:
+    """Where G is certainly 1 (False), and where it certainly is less (True).
 
     G is 1 where min(ci, cr) (ci + cr) >= cos^2 of half the angle between sun and view.
     """
@@ -147,11 +188,10 @@ def _attenuated(sun: Cones, view: Cones) -> bool | None:
     (low_i, high_i), (low_r, high_r) = sun.zenith_deg, view.zenith_deg
     least = _lesser_times_sum(high_i, high_r)
     most = _lesser_times_sum(low_i, low_r)
-    if np.all(least > _cos2_half(np.maximum(apart - unsure, 0)) * (1 + ROUNDING)):
-        return False
-    if np.all(most < _cos2_half(np.minimum(apart + unsure, 180)) * (1 - ROUNDING)):
-        return True
-    return None
+    return {
+        False: least > _cos2_half(np.maximum(apart - unsure, 0)) * (1 + ROUNDING),
+        True: most < _cos2_half(np.minimum(apart + unsure, 180)) * (1 - ROUNDING),
+    }
 
 
 def _lesser_times_sum(incidence_deg: Array, exitance_deg: Array) -> Array:
