@@ -149,7 +149,7 @@ def test_a_winding_flight_from_the_definition(tmp_path):
     line = LineView(read_trajectory(path, GRID))
     ground = GRID.xy(*np.mgrid[BLOCK.slices])
     heights = rng.uniform(0, 20, BLOCK.shape)
-    seconds = line.seconds(*ground, heights)
+    seconds = line.look(GRID, BLOCK, heights).seconds
     position, forward = line.trajectory.at(seconds)
     to_sensor = position - np.stack([*ground, heights])
     assert np.abs((to_sensor * forward).sum(axis=0)).max() < 1e-3

@@ -99,9 +99,9 @@ def test_a_scan_line_by_hand(tmp_path):
         for scan_angle in np.deg2rad([-35, -11, 0.0, 20, 33]):
             ray = turn @ [0, np.sin(scan_angle), np.cos(scan_angle)]
             hit = sensor + ray * (12.0 - sensor[2]) / ray[2]
-            assert line.seconds(*hit) == pytest.approx(0.1 * index, abs=1e-7)
-            look = line._passes(*(np.full((1, 1), value) for value in hit))
-            assert angle_between(look[1][:, 0, 0], -ray) < 1e-6
+            seconds, vectors = line._passes(*(np.full((1, 1), value) for value in hit))
+            assert seconds[0, 0] == pytest.approx(0.1 * index, abs=1e-7)
+            assert angle_between(vectors[:, 0, 0], -ray) < 1e-6
 
 
 def rough_flight(seed=5, count=400):

@@ -61,12 +61,6 @@ class LineView(View):
             return Look(vectors, seconds)
         return Look(vectors, np.where(unseen, 0.0, seconds), unseen)
 
-    def seconds(self, x: Array, y: Array, z: Array) -> Array:
-        """When each ground point was seen, in seconds since `trajectory.start`; nan where it never was."""
-        shape = np.broadcast_shapes(np.shape(x), np.shape(y), np.shape(z))
-        points = (np.broadcast_to(values, shape).reshape(1, -1) for values in (x, y, z))
-        return self._passes(*points)[0].reshape(shape)
-
     def _passes(self, x: Array, y: Array, z: Array, wanted: Array | None = None) -> tuple[Array, Array]:
         """Times (rows, cols) and vectors (3, rows, cols) of points that broadcast to (rows, cols)."""
         from tscorr.sensor.compiled import EVERYWHERE, passes
@@ -149,7 +143,10 @@ class LineView(View):
 
         Points that no scan plane goes over are left out. Raises InputError where that is all of them.
         """
-        seconds = self.seconds(*_lattice(grid), np.full((SAMPLES, SAMPLES), height_m))
+        points = np.stack([*_lattice(grid), np.full((SAMPLES, SAMPLES), height_m)])
+        candidates = self._candidates(*points)
+        passes = (self._passes_of(point, candidates)[0] for point in points.reshape(3, -1).T)
+        seconds = np.array([next(iter(times), np.nan) for times in passes]).reshape(SAMPLES, SAMPLES)
         seen = seconds[np.isfinite(seconds)]
         if not seen.size:
             raise InputError(
