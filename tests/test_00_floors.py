@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1] / "tscorr"
 FLOORS = {
-    0: "errors texts angles grid kernels interpreter",
+    0: "errors texts angles grid kernels interpreter loops",
     1: "reference materials sun sensor",
     2: "terrain width fit correction config eye",
     3: "rasters publish report stac bench quicklook",

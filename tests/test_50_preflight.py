@@ -57,7 +57,7 @@ def test_everything_that_is_wrong_is_told_at_once(tmp_path):
     )
     told = problems(config)
     wanted = [
-        "no material 'roof_tyle' (did you mean 'roof_tile'?)",
+        "[materials.classes] 1: no material 'roof_tyle' (did you mean 'roof_tile'?)",
         f"scene 'a': {tmp_path}/nix.tif does not exist",
         f"scene 'b': {tmp_path}/no_classes.tif does not exist",
         f"scene 'b': the class confidence {tmp_path}/percent.tif holds values from 80 to 80; allowed are 0 to 1",

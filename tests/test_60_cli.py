@@ -134,7 +134,7 @@ BAD = {
     "missing library": (missing_library, ["nix.toml cannot be read"]),
     "unknown material": (
         lambda folder: small_scene(folder, materials={"classes": {"1": "roof_tyle"}}),
-        ["no material 'roof_tyle'", "did you mean 'roof_tile'", "red_aluminum"],
+        ["[materials.classes] 1: no material 'roof_tyle'", "did you mean 'roof_tile'", "red_aluminum"],
     ),
     "wrong band count": (changed_scene(wavelength_um=[0.5, 0.6]), ["2 values", "image.tif has 3 bands"]),
     "wrong count of fractions": (
@@ -235,7 +235,7 @@ BAD = {
         ),
         ["uncorrectable = 'nodata'", "image.tif has no nodata value"],
     ),
-    "direct fraction above one": (changed_scene(direct_fraction=1.2), ["direct_fraction = [1.2", "0 to 1"]),
+    "direct fraction above one": (changed_scene(direct_fraction=1.2), ["direct_fraction = 1.2;", "0 to 1"]),
 }
 
 

@@ -74,15 +74,14 @@ def write_whole(path: Path, text: str) -> None:
 class Publication:
     """A folder in the making: write into `.folder`, then `commit`. Leaving without a commit deletes it.
 
-    threads : that may be busy at a time, those which hash the files among them.
-    algorithm : one of HASHES.
+    algorithm : one of HASHES. early : hash files as soon as they are whole, beside other work.
     """
 
-    def __init__(self, target: Path, threads: int = 1, algorithm: str = "blake3") -> None:
+    def __init__(self, target: Path, *, algorithm: str = "blake3", early: bool = False) -> None:
         self.target = target
         self._algorithm = algorithm
         self.folder = hidden_name(target, "part")
-        self._threads = threads
+        self._early = early
         self._hasher = ThreadPoolExecutor(1)
         self._hashes: dict[Path, Future[str]] = {}
 
@@ -98,8 +97,8 @@ class Publication:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def hash_early(self, path: Path) -> None:
-        """Start to hash a file of the folder that is whole, where a thread is free while others are still written."""
-        if self._threads > 1:
+        """Start to hash a file of the folder that is whole, if that is to be done while others are still written."""
+        if self._early:
             self._hash(path)
 
     def _hash(self, path: Path) -> None:

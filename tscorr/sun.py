@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from tscorr.angles import angle_between, grid_azimuth, true_azimuth, unit_vector, zenith_azimuth
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid, convergence_deg, convergences_deg, longitude_latitude, require_crs
+from tscorr.loops import LOOP
 
 Array = NDArray[Any]
 
@@ -188,7 +189,7 @@ def _directions(knots: Array, down: Array, right: Array, instants: Array) -> Arr
     return result
 
 
-@njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False)  # type: ignore[untyped-decorator] # numba has no types
+@njit(**LOOP)  # type: ignore[untyped-decorator] # numba has no types
 def _between(knots: Array, down: Array, right: Array, instants: Array, result: Array) -> None:
     """`_directions` into `result`; nothing is allocated in compiled code, which halves what there is to compile."""
     height, width = instants.shape

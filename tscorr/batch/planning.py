@@ -47,7 +47,8 @@ def plan(
         try:
             find(name, library)
         except TscorrError as error:
-            problems.append(error)
+            classes = ", ".join(str(value) for value, its in settings.materials.classes.items() if its == name)
+            problems.append(type(error)(f"[materials.classes] {classes}: {error}"))
             library[name] = library["lambertian"]  # so that the scenes can be checked all the same
     planned = []
     describe = cache(rasters.describe)  # class maps and surface models serve many scenes

@@ -31,6 +31,7 @@ def run(
     settings  : a configuration, or the path of one.
     scheduler : address of a Dask scheduler, in place of that of the configuration.
     overwrite : recompute scenes whose published result is current.
+    progress  : given a scene that starts, a function that is told of pixels done; several threads call both.
     Raises ConfigError, MaterialError or InputError before any work starts, OutputError where another batch is at work
     in the folder; later errors fail their scene.
 

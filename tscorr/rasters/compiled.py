@@ -2,8 +2,10 @@
 
 from numba import njit
 
+from tscorr.loops import LOOP
 
-@njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False)
+
+@njit(**LOOP)
 def set_differences(values, top, left, tile):
     """Predictor 2 of a tile (rows, cols, samples): each value less its left neighbour's, modulo the range of the type.
 

@@ -2,8 +2,10 @@
 
 from numba import njit
 
+from tscorr.loops import LOOP
 
-@njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False)
+
+@njit(**LOOP)
 def count_values(flags, counts):
     """Add to `counts`, int64 (65536,), the pixels with each value of uint16 flags (rows, cols)."""
     for i in range(flags.shape[0]):

@@ -92,7 +92,7 @@ def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
     with (
         closing(scene),
         publish.EarlyHashes(scene.inputs, algorithm) as hashes,
-        publish.Publication(target_of(scene), threads_of(scene), algorithm) as publication,
+        publish.Publication(target_of(scene), algorithm=algorithm, early=threads_of(scene) > 1) as publication,
     ):
         pipeline = Pipeline(scene, publication.folder, final=publication.hash_early)
         sums, lights, written = pipeline.run(progress), pipeline.lights, pipeline.written

@@ -10,15 +10,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-PART: dict[str, Any] = {
-    "nogil": True,
-    "error_model": "numpy",
-    "_nrt": False,
-    "no_cfunc_wrapper": True,
-    "no_cpython_wrapper": True,
-}
-LOOP: dict[str, Any] = {**PART, "no_cpython_wrapper": False, "cache": True}
-"""compiled without reference counts; parts are called from loops only"""
+from tscorr.loops import LOOP, PART
 
 ONE = np.float32(1)
 SPAN = 64

@@ -15,10 +15,11 @@ Nothing is allocated here, results and scratch memory are given: that halves wha
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
+
+from tscorr.loops import LOOP, PART
 
 REACH_PX = 32  # a face is cut beyond this distance from its seed, so that the result is local
 SEED_RADIUS = 2  # of the windows from which faces grow first
@@ -30,17 +31,8 @@ MERGE_CHI2 = 16.3  # exceeded by 0.1 % of chi-square with 3 degrees of freedom
 CLEAR_MEETING = 0.5  # of 1: how clearly two faces must show a ridge or a valley
 SEED_CLASSES = 64  # of rms, in which faces grow one after the other
 
-_PART: dict[str, Any] = {
-    "nogil": True,
-    "error_model": "numpy",
-    "_nrt": False,
-    "no_cfunc_wrapper": True,
-    "no_cpython_wrapper": True,
-}
-_LOOP: dict[str, Any] = {**_PART, "no_cpython_wrapper": False, "cache": True}
 
-
-@njit(**_PART)
+@njit(**PART)
 def _add(moments, x, y, h):
     moments[0] += 1.0
     moments[1] += x
@@ -54,7 +46,7 @@ def _add(moments, x, y, h):
     moments[9] += h * h
 
 
-@njit(**_PART)
+@njit(**PART)
 def _centred(moments):
     """Centred second moments: xx, xy, yy, xh, yh, hh."""
     n = moments[0]
@@ -69,7 +61,7 @@ def _centred(moments):
     )
 
 
-@njit(**_PART)
+@njit(**PART)
 def _solve(moments, plane):
     """Set the least-squares plane of the pixels; False, and no plane, if they are in a line."""
     xx, xy, yy, xh, yh, _ = _centred(moments)
@@ -84,7 +76,7 @@ def _solve(moments, plane):
     return True
 
 
-@njit(**_PART)
+@njit(**PART)
 def _misfit(moments):
     """Sum of squared residuals from the least-squares plane of the pixels."""
     xx, xy, yy, xh, yh, hh = _centred(moments)
@@ -94,12 +86,12 @@ def _misfit(moments):
     return max(hh - (xh * xh * yy - 2.0 * xh * yh * xy + yh * yh * xx) / determinant, 0.0)
 
 
-@njit(**_PART)
+@njit(**PART)
 def _height(plane, col, row):
     return plane[4] + plane[0] * (col - plane[2]) + plane[1] * (row - plane[3])
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def window_fits(z, datum, tilts, rms, sums):
     """Least-squares planes of all full windows into fits `tilts`, `rms`; `sums` is (3, cols) of scratch."""
     radius, (rows, cols) = SEED_RADIUS, z.shape
@@ -128,7 +120,7 @@ def window_fits(z, datum, tilts, rms, sums):
                 rms[i, j] = math.sqrt(max(rest, 0.0) / (n - 3))
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def free_fits(z, datum, labels, step, tilts, rms, moments, plane):
     """As `window_fits`, for what is left: 3 x 3 around free pixels (label 0), of free pixels only.
 
@@ -159,7 +151,7 @@ def best_first(rms, sigma):
     return seeds[np.argsort(classes, kind="stable")]
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def grow(z, datum, labels, tilts, seeds, tolerance, first_fit, label, queue, moments, plane):
     """Spread planes from seeds, best first, over free neighbours (label 0) that fit: next free label.
 
@@ -203,7 +195,7 @@ def grow(z, datum, labels, tilts, seeds, tolerance, first_fit, label, queue, mom
     return label
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def add_moments(z, datum, labels, planes, tolerance, moments):
     """Add to the moments of each face its pixels that lie within `tolerance` of its plane; inf takes all."""
     for i in range(z.shape[0]):
@@ -215,7 +207,7 @@ def add_moments(z, datum, labels, planes, tolerance, moments):
                     _add(moments[label], j, i, h)
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def fit_planes(moments, planes):
     """Fit the plane of each face; a face with too few pixels, or pixels in a line, keeps the one it had."""
     for label in range(1, len(moments)):
@@ -223,7 +215,7 @@ def fit_planes(moments, planes):
             _solve(moments[label], planes[label])
 
 
-@njit(**_PART)
+@njit(**PART)
 def _root(parent, label):
     while parent[label] != label:
         parent[label] = parent[parent[label]]
@@ -231,7 +223,7 @@ def _root(parent, label):
     return label
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def merge(labels, moments, sigma, parent, both):
     """Join touching pieces that one plane fits as well as two; changes labels and moments.
 
@@ -277,7 +269,7 @@ def border(labels):
     return np.flatnonzero(beside)
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def relabel(z, datum, labels, planes, sigma, border, near, votes):
     """One sweep: each pixel at a border takes the neighbouring face of least cost, or none (0).
 
@@ -309,7 +301,7 @@ def relabel(z, datum, labels, planes, sigma, border, near, votes):
                 labels[i, j], least = near[k], cost
 
 
-@njit(**_PART)
+@njit(**PART)
 def _valley(labels, planes, own, other, i, j, limit):
     """How two faces meet near a pixel, from -1 (ridge: the surface is the lower plane) to 1 (valley)."""
     middle = _height(planes[own], j, i) - _height(planes[other], j, i)
@@ -324,7 +316,7 @@ def _valley(labels, planes, own, other, i, j, limit):
     return valley / total if total > 0.0 else 0.0
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def resolve(z, datum, labels, planes, sigma, tolerance, border, settled):
     """Into `settled`, a copy of the labels: the pixels on the planes of two faces settled by how the faces meet.
 
@@ -355,7 +347,7 @@ def resolve(z, datum, labels, planes, sigma, tolerance, border, settled):
                     settled[i, j] = other
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def mark_undecided(labels, planes, limit, tilt, cell_x_m, cell_y_m, border, result):
     """Set pixels within `limit` of the plane of a neighbouring face whose slope differs by more than `tilt`."""
     rows, cols = labels.shape
@@ -372,7 +364,7 @@ def mark_undecided(labels, planes, limit, tilt, cell_x_m, cell_y_m, border, resu
                 result[i, j] |= apart > tilt and gap < limit
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def adopt(z, datum, labels, planes, adopted):
     """Into `adopted`, a copy of the labels: pixels on no face take the face in 5 x 5 whose plane is nearest."""
     rows, cols = z.shape

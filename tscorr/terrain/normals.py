@@ -23,21 +23,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from tscorr.errors import InputError
+from tscorr.loops import LOOP, PART
 
 HORN_HALO_PX = 1
 SPAN = 64
 """pixels of a row for which it is told at once whether any is wanted"""
 EVERYWHERE = np.ones((1, 1), np.bool_)
-
-PART: dict[str, Any] = {
-    "nogil": True,
-    "error_model": "numpy",
-    "_nrt": False,
-    "no_cfunc_wrapper": True,
-    "no_cpython_wrapper": True,
-}
-LOOP: dict[str, Any] = {**PART, "no_cpython_wrapper": False, "cache": True}
-"""compiled without reference counts; parts are called from loops only"""
 
 
 class WindowNormals(NamedTuple):

@@ -7,34 +7,26 @@ what there is to compile. Imports nothing of ours: numba's cache does not see ed
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
+
+from tscorr.loops import LOOP, PART
 
 WALL_SLOPE = 2.0  # 63 degrees: steeper than roofs, less steep than any wall of more than a pixel
 SHEER_M = 1e5  # a line of sight that rises by so much in a pixel is above everything
 TILE_PX = 16  # a march skips such squares where it is above their highest point
 VOID = np.float32(-1e9)  # a surface so low that it hides nothing
 
-_PART: dict[str, Any] = {
-    "nogil": True,
-    "error_model": "numpy",
-    "_nrt": False,
-    "no_cfunc_wrapper": True,
-    "no_cpython_wrapper": True,
-}
-_LOOP: dict[str, Any] = {**_PART, "no_cpython_wrapper": False, "cache": True}
 
-
-@njit(**_PART)
+@njit(**PART)
 def _between(a, b, fraction, wall):
     """The surface a `fraction` of the way from `a` to `b`: a straight line, or a wall midway."""
     nearest = b if fraction >= np.float32(0.5) else a
     return nearest if abs(b - a) > wall else a + fraction * (b - a)
 
 
-@njit(**_PART)
+@njit(**PART)
 def _load(line, heights, i, transposed, origin):
     """Line `i` of the heights above the origin, voids sunk, and the pixel at each end once more."""
     width = line.size - 2
@@ -50,7 +42,7 @@ def _load(line, heights, i, transposed, origin):
     line[0], line[width + 1] = line[1], line[width]
 
 
-@njit(**_PART)
+@njit(**PART)
 def _store(visible, i, transposed, seen):
     """Put what is seen of line `i` in its place."""
     if transposed:
@@ -61,7 +53,7 @@ def _store(visible, i, transposed, seen):
             visible[i, m] = seen[m]
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def judge_parallel(
     heights, visible, rays, line, seen, transposed, backwards, first, low, ray0, slant, drop, central, depth, apex,
     origin, walls, tolerance,
@@ -114,7 +106,7 @@ def judge_parallel(
         _store(visible, i, transposed, seen)
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def judge_fan(
     heights, visible, rays, line, seen, tangents, walls, transposed, backwards, first, low, scene_width, nadir,
     origin, wall_across, tolerance,
@@ -160,7 +152,7 @@ def judge_fan(
         _store(visible, i, transposed, seen)
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def set_peaks(heights, highest):
     """Raise `highest` to the highest point of each tile of `TILE_PX` and of the pixels that touch it."""
     rows, cols = heights.shape
@@ -182,7 +174,7 @@ def peaks(heights):
     return highest
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def march(heights, tile_peaks, highest, direction, needed, first, cell, tolerance, visible):
     """Set in `visible` whether each needed pixel of a window sees its source.
 
@@ -201,7 +193,7 @@ def march(heights, tile_peaks, highest, direction, needed, first, cell, toleranc
                 )
 
 
-@njit(**_PART)
+@njit(**PART)
 def _is_free(heights, tile_peaks, row, col, down, right, up, cell, highest, eye):
     """Whether the ray that leaves a pixel at the height `eye` meets nothing; `down`, `right` in pixels."""
     by_rows = abs(down) >= abs(right)
@@ -233,7 +225,7 @@ def _is_free(heights, tile_peaks, row, col, down, right, up, cell, highest, eye)
     return True
 
 
-@njit(**_PART)
+@njit(**PART)
 def _steps_left(position, step, tile):
     """How many steps a ray can surely take within the tile."""
     if step > 0.0:
@@ -241,7 +233,7 @@ def _steps_left(position, step, tile):
     return (position - tile * TILE_PX) / -step if step < 0.0 else np.inf
 
 
-@njit(**_PART)
+@njit(**PART)
 def _surface(heights, row, col, down, right, by_rows, wall):
     """The surface where a ray from (row, col) crosses a line of pixels; the scene's edge goes on level.
 
@@ -261,7 +253,7 @@ def _surface(heights, row, col, down, right, by_rows, wall):
     return _between(_sunk(a), _sunk(b), across - whole, wall)
 
 
-@njit(**_PART)
+@njit(**PART)
 def _sunk(height):
     """The height, or a depth where it is void."""
     return np.float64(VOID if np.isnan(height) else height)
