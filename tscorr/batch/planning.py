@@ -1,13 +1,21 @@
 """All scenes checked before work on any of them starts."""
 
+import logging
 from collections.abc import Sequence
 from functools import cache
+
+import numpy as np
 
 from tscorr import config, rasters
 from tscorr.batch.preflight import preflight
 from tscorr.errors import ConfigError, InputError, TscorrError, nearest
 from tscorr.materials import Material, builtin_materials, find, load_materials
 from tscorr.scene.plan import Scene, plan_scene
+
+log = logging.getLogger("tscorr")
+
+HIGHEST_FACTOR = 2.0
+"""reflectance factors of a city are rarely higher, and never half of them"""
 
 
 def library_of(settings: config.Config) -> dict[str, Material]:
@@ -64,4 +72,30 @@ def plan(
     if problems:
         kind = type(problems[0]) if len({type(problem) for problem in problems}) == 1 else InputError
         raise kind("\n".join(map(str, problems)))
+    _warn_of_missing_scales(planned)
     return planned
+
+
+def _warn_of_missing_scales(planned: Sequence[Scene]) -> None:
+    """Stored values without a scale, as many images have them, would leave next to nothing to be removed."""
+    doubtful = [scene for scene in planned if _misses_scale(scene)]
+    if doubtful:
+        image, others = doubtful[0].image, len(doubtful) - 1
+        log.warning(
+            "the image %s%s holds %s values and has no scale: they are taken for reflectance factors as they are; if "
+            "10000 stands for 1, give scale = 0.0001, and if they are right, scale = 1.0",
+            image.path,
+            f", like {others} more," if others else "",
+            image.dtype,
+        )
+
+
+def _misses_scale(scene: Scene) -> bool:
+    """Whether the values of an image, for which nobody gives a scale, are too high for reflectance factors."""
+    image = scene.image
+    if scene.settings.scale is not None or set(image.scales) != {1.0} or any(image.offsets):
+        return False
+    if image.dtype.kind != "f":
+        return True
+    values = rasters.read_samples(image, 2, 32)
+    return bool(values.size and np.median(values) > HIGHEST_FACTOR)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tscorr import config, publish, rasters
-from tscorr.correction import NEGLIGIBLE_REFLECTANCE, ReferenceDirections, Rules, Stored, check_ratio
-from tscorr.errors import ConfigError, InputError, MaterialError, TscorrError
+from tscorr.correction import Rules, Stored, check_ratio
+from tscorr.errors import ConfigError, InputError, TscorrError
 from tscorr.grid import Grid
 from tscorr.materials import BandParameters, Material, find
-from tscorr.scene.bad_bands import parameters_of
+from tscorr.scene.bands import at_bands, rules_of, stored_of, wavelengths_of
 from tscorr.scene.directions import Seen, close_all, obs_file, sun_of, view_of
 from tscorr.sensor import View
 from tscorr.sun import Sun
@@ -153,8 +153,8 @@ def plan_scene(
     class_map = checks(_class_map, settings, whole, image, describe)
     confidence = checks(_confidence, settings, image, describe)
     checks(_check_truth, settings.truth, image)
-    stored = checks(_stored, settings, whole.correction, image)
-    wavelengths = checks(_wavelengths, settings, image)
+    stored = checks(stored_of, settings, whole.correction, image)
+    wavelengths = checks(wavelengths_of, settings, image)
     seen = checks(view_of, settings.view, image)
     surface_files = checks(_surface_files, settings.surface, image, describe)
     checks.settle()
@@ -163,7 +163,7 @@ def plan_scene(
     materials = tuple(
         (
             find(name, library),
-            checks(_at_bands, find(name, library), wavelengths, image),
+            checks(at_bands, find(name, library), wavelengths, image),
             checks(rules_of, name, settings, whole, stored, image, only),
         )
         for name in names
@@ -293,120 +293,6 @@ def _check_truth(truth: config.Truth | None, image: rasters.RasterInfo) -> None:
                 f"the truth {info.path} has {info.bands} bands of {info.shape}; allowed are {bands} of {image.shape}, "
                 f"as the image has them"
             )
-
-
-def _at_bands(surface: Material, wavelengths: tuple[float, ...] | None, image: rasters.RasterInfo) -> BandParameters:
-    try:
-        return parameters_of(surface, wavelengths, image.bad_bands, image.bands)
-    except MaterialError as error:
-        raise MaterialError(f"{error}; image {image.path}") from None
-
-
-def _wavelengths(settings: config.Scene, image: rasters.RasterInfo) -> tuple[float, ...] | None:
-    given = settings.wavelength_um
-    if given is None:
-        return image.wavelengths_um
-    return _per_band(given, image, "wavelength_um")
-
-
-def _per_band(value: float | Sequence[float], image: rasters.RasterInfo, what: str) -> tuple[float, ...]:
-    """One value a band from one value or a list."""
-    if isinstance(value, int | float):
-        return (float(value),) * image.bands
-    if len(value) != image.bands:
-        raise ConfigError(
-            f"{what} has {len(value)} values; the image {image.path} has {image.bands} bands: allowed are one "
-            f"value, or one a band"
-        )
-    return tuple(value)
-
-
-def _stored(settings: config.Scene, correction: config.Correction, image: rasters.RasterInfo) -> Stored:
-    scale = image.scales if settings.scale is None else _per_band(settings.scale, image, "scale")
-    offset = image.offsets if settings.offset is None else _per_band(settings.offset, image, "offset")
-    for name, values in (("scale", scale), ("offset", offset)):
-        for value in values:
-            if not np.isfinite(value) or (name == "scale" and value == 0):
-                allowed = "any number but 0" if name == "scale" else "any number"
-                raise InputError(
-                    f"the image {image.path} has the {name} {value:g}; allowed is {allowed}: give {name} = ..."
-                )
-    to_factor = np.pi if settings.quantity == "brdf" else 1.0
-    if settings.nodata is not None and not rasters.can_hold(image.dtype, settings.nodata):
-        raise ConfigError(f"nodata = {settings.nodata:g}, which no {image.dtype} pixel of {image.path} can be")
-    saturation = None if settings.saturation is None else _per_band(settings.saturation, image, "saturation")
-    if saturation is not None and image.bad_bands:
-        saturation = tuple(np.where(image.bad_bands, np.inf, saturation).tolist())
-    return Stored(
-        dtype=image.dtype,
-        scale=tuple(value * to_factor for value in scale),
-        offset=tuple(value * to_factor for value in offset),
-        nodata=image.nodata if settings.nodata is None else settings.nodata,
-        saturation=saturation,
-        noise=_noise(correction, image),
-        direction_sigma_deg=correction.direction_sigma_deg,
-    )
-
-
-def _noise(correction: config.Correction, image: rasters.RasterInfo) -> tuple[tuple[float, float], ...]:
-    """a, b of the image's noise for each band."""
-    noise = correction.image_noise
-    pairs = noise if isinstance(noise, list) else [noise] * image.bands
-    if len(pairs) != image.bands:
-        raise ConfigError(
-            f"image_noise has {len(pairs)} pairs; the image {image.path} has {image.bands} bands: allowed are one "
-            f"pair, or one a band"
-        )
-    return tuple(pairs)
-
-
-def rules_of(
-    name: str,
-    settings: config.Scene,
-    whole: config.Config,
-    stored: Stored,
-    image: rasters.RasterInfo,
-    only: Sequence[str] = (),
-) -> Rules:
-    """How one material is corrected: [model] and [correction], then the scene, then the material's own."""
-    own = whole.materials.settings.get(name, config.MaterialSettings())
-    values = {
-        **whole.model.model_dump(),
-        **whole.correction.model_dump(),
-        **({} if settings.direct_fraction is None else {"direct_fraction": settings.direct_fraction}),
-        **own.model_dump(exclude_none=True),
-    }
-    fractions = _per_band(values["direct_fraction"], image, "direct_fraction")
-    if any(not 0 <= fraction <= 1 for fraction in fractions):
-        raise ConfigError(f"direct_fraction = {values['direct_fraction']}; allowed are shares from 0 to 1")
-    fraction_sigma = _per_band(values["direct_fraction_sigma"], image, "direct_fraction_sigma")
-    if any(not 0 <= sigma <= 1 for sigma in fraction_sigma):
-        raise ConfigError(f"direct_fraction_sigma = {values['direct_fraction_sigma']}; allowed are shares from 0 to 1")
-    negligible = values["negligible_reflectance"]
-    if negligible is None:
-        negligible = stored.step / 2 if stored.step is not None else NEGLIGIBLE_REFLECTANCE
-    if values["uncorrectable"] == "nodata" and stored.nodata is None:
-        raise ConfigError(
-            f"uncorrectable = 'nodata', but the image {image.path} has no nodata value: give nodata = ..."
-        )
-    return Rules(
-        form=values["form"],
-        precision=values["precision"],
-        negligible_reflectance=negligible,
-        uncorrectable=values["uncorrectable"],
-        uncorrectable_share=values["uncorrectable_share"],
-        max_zenith_deg=values["max_zenith_deg"],
-        irradiance_plane=values["irradiance_plane"],
-        direct_fraction=fractions,
-        direct_fraction_sigma=fraction_sigma,
-        method=values["method"],
-        reference=ReferenceDirections(**values["reference"]),
-        sky_specular=values["sky_specular"],
-        normal_sigma_deg=values["normal_sigma_deg"],
-        average_normals=values["average_normals"],
-        material_covariance=values["material_covariance"],
-        enabled=values["enabled"] and (not only or name in only),
-    )
 
 
 def _surface_files(settings: Any, image: rasters.RasterInfo, describe: Describe) -> tuple[rasters.RasterInfo, ...]:

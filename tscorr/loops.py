@@ -1,0 +1,14 @@
+"""How loops over pixels are compiled: without reference counts, since they allocate nothing, which halves the work."""
+
+from typing import Any
+
+PART: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "_nrt": False,
+    "no_cfunc_wrapper": True,
+    "no_cpython_wrapper": True,
+}
+"""called from other compiled code only"""
+LOOP: dict[str, Any] = {**PART, "no_cpython_wrapper": False, "cache": True}
+"""called from Python"""
