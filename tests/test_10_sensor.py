@@ -117,6 +117,14 @@ def test_without_attitude_the_sensor_is_abeam(tmp_path, attitude):
     np.testing.assert_allclose(y, 447575.0, atol=1e-6)
 
 
+def test_a_scene_is_seen_from_when_its_first_column_is_abeam_to_when_its_last_is(tmp_path):
+    line = eastward(tmp_path)
+    rows, cols = GRID.shape
+    x, _ = GRID.xy(np.array([0, (rows - 1) / 2, 0]), np.array([0, (cols - 1) / 2, cols - 1]))
+    seconds = np.interp(x, line.trajectory.table[0], line.trajectory.seconds)
+    np.testing.assert_allclose(line.span(GRID, 20.0), seconds, atol=1e-3)
+
+
 def test_nose_up_looks_ahead(tmp_path):
     """Pitch 5 at 1000 m: a pixel is seen from (1000 - z) tan 5 before the point abeam."""
     line = eastward(tmp_path, roll_deg=0.0, pitch_deg=5.0, heading_deg=EAST_TRUE)

@@ -106,18 +106,38 @@ def test_what_is_not_certain_is_computed(tmp_path, scene):
     assert with_and_without(tmp_path, {**STEEP, **scene}, **METAL_ONLY)["blocks_out_of_reach"] == 0
 
 
+WIDE = 16, 3585
+"""eight blocks, the last of which is one pixel wide"""
+
+
+def write_wide_inputs(folder):
+    """All metal."""
+    values = np.random.default_rng(5).integers(3000, 6000, (BANDS, *WIDE)).astype(np.int16)
+    write_image(folder / "image.tif", values)
+    write_raster(folder / "class_map.tif", np.full(WIDE, METAL, np.uint8))
+
+
 @pytest.mark.parametrize("glare_px", [0, 2000, 3100, 3584])
 def test_of_a_wide_scene_the_blocks_out_of_reach_are_skipped(tmp_path, glare_px):
-    """The last block is one pixel wide; the camera mirrors the sun at the column that is named."""
-    shape = 16, 3585
-    rng = np.random.default_rng(5)
-    write_image(tmp_path / "image.tif", rng.integers(3000, 6000, (BANDS, *shape)).astype(np.int16))
-    write_raster(tmp_path / "class_map.tif", np.full(shape, METAL, np.uint8))
+    """The camera mirrors the sun at the column that is named."""
+    write_wide_inputs(tmp_path)
     position = [WEST + CELL * glare_px, NORTH + 800 * np.tan(np.deg2rad(50)), 800.0]
     scene = {**STEEP, "view": {"kind": "frame", "position": position}}
     skipped = with_and_without(tmp_path, scene, **METAL_ONLY)
     assert skipped["blocks"] == 8
     assert 2 <= skipped["blocks_out_of_reach"] <= 6
+
+
+def test_where_a_line_ends_the_blocks_before_are_skipped_all_the_same(tmp_path):
+    """It goes east along the scene and ends above its sixth block; one band has no direct light."""
+    write_wide_inputs(tmp_path)
+    x = np.linspace(WEST - 200, WEST + 0.8 * WIDE[1] * CELL, 60)
+    lines = [f"2026-06-21T10:12:{second:02d}Z,{at},{NORTH - 4},500" for second, at in enumerate(x)]
+    (tmp_path / "line.csv").write_text("utc,x,y,z\n" + "\n".join(lines) + "\n")
+    scene = {**STEEP, "view": {"kind": "line", "trajectory": "line.csv"}, "direct_fraction": [0.0, 1.0, 1.0]}
+    skipped = with_and_without(tmp_path, scene, **METAL_ONLY)
+    assert skipped["blocks"] == 8
+    assert skipped["blocks_out_of_reach"] == 5
 
 
 def test_beyond_the_ends_of_a_line_nothing_is_taken_for_seen(tmp_path):

@@ -4,8 +4,6 @@ import logging
 from collections.abc import Sequence
 from functools import cache
 
-import numpy as np
-
 from tscorr import config, rasters
 from tscorr.batch.preflight import preflight
 from tscorr.errors import ConfigError, InputError, TscorrError, nearest
@@ -13,9 +11,6 @@ from tscorr.materials import Material, builtin_materials, find, load_materials
 from tscorr.scene.plan import Scene, plan_scene
 
 log = logging.getLogger("tscorr")
-
-HIGHEST_FACTOR = 2.0
-"""reflectance factors of a city are rarely higher, and never half of them"""
 
 
 def library_of(settings: config.Config) -> dict[str, Material]:
@@ -77,25 +72,17 @@ def plan(
 
 
 def _warn_of_missing_scales(planned: Sequence[Scene]) -> None:
-    """Stored values without a scale, as many images have them, would leave next to nothing to be removed."""
-    doubtful = [scene for scene in planned if _misses_scale(scene)]
+    """Of whole numbers without a scale, as many images hold them, next to nothing would be removed."""
+    doubtful = [
+        scene.image
+        for scene in planned
+        if scene.image.dtype.kind in "iu" and scene.settings.scale is None and set(scene.image.scales) == {1.0}
+    ]
     if doubtful:
-        image, others = doubtful[0].image, len(doubtful) - 1
         log.warning(
-            "the image %s%s holds %s values and has no scale: they are taken for reflectance factors as they are; if "
-            "10000 stands for 1, give scale = 0.0001, and if they are right, scale = 1.0",
-            image.path,
-            f", like {others} more," if others else "",
-            image.dtype,
+            "the image %s%s holds %s values and no scale, so that the least above 0 is 1: give scale = ..., 0.0001 "
+            "where 10000 stands for 1, or scale = 1.0 where that is right",
+            doubtful[0].path,
+            f", like {len(doubtful) - 1} more," if len(doubtful) > 1 else "",
+            doubtful[0].dtype,
         )
-
-
-def _misses_scale(scene: Scene) -> bool:
-    """Whether the values of an image, for which nobody gives a scale, are too high for reflectance factors."""
-    image = scene.image
-    if scene.settings.scale is not None or set(image.scales) != {1.0} or any(image.offsets):
-        return False
-    if image.dtype.kind != "f":
-        return True
-    values = rasters.read_samples(image, 2, 32)
-    return bool(values.size and np.median(values) > HIGHEST_FACTOR)

@@ -1,6 +1,6 @@
 """Blocks of level ground that are out of reach of every lobe, for certain (`width.f_spec_bound`).
 
-A block is cut into patches. Sun and view of a patch lie within small cones, so its angles lie in a box, for which
+The ground is cut into patches. Sun and view of a patch lie within small cones, so its angles lie in a box, for which
 there is a number that f_spec does not exceed. What a block out of reach is flagged with must be as certain: every
 pixel lit, seen and not too steep, and G below 1 in all of them or in none, since the report counts them.
 """
@@ -25,9 +25,11 @@ from tscorr.width import f_spec_bound
 Array = NDArray[Any]
 
 PATCH_PX = 64
-REGION_COLUMNS = 48 * PATCH_PX
-"""half of a stripe of blocks, and little enough memory for hundreds of bands"""
+REGION_COLUMNS = 3072
+"""as many blocks as fit make a region: little enough memory for hundreds of bands"""
 KEPT_REGIONS = 8
+FAN_PATCHES = 8
+"""columns of patches that a line scanner is asked for at a time: what else may pass one of them counts for all"""
 ROUNDING_DEG = 1e-3
 """more than directions and cosines of the correction err by"""
 ROUNDING = 1e-4
@@ -90,20 +92,22 @@ class Reach:
         """
         with self._lock:
             region = self._region(block)
-            patches = region.patches(block)
-            if region.unknown[:, patches].any():
+        patches = region.patches(block)
+        if region.unknown[:, patches].any():
+            return None
+        for row in rows:
+            with self._lock:
+                if row not in region.may_reach:
+                    region.may_reach[row] = self._may_reach(region, row)
+            if region.may_reach[row][:, patches].any():
                 return None
-            for row in rows:
-                if row not in region.reached:
-                    region.reached[row] = self._reached(region, row)
-                if region.reached[row][:, patches].any():
-                    return None
         return next((state for state, certain in region.attenuated.items() if certain[:, patches].all()), None)
 
     def _region(self, block: Block) -> "Region":
         """The region that holds a block; the last ones are kept."""
-        first = block.col // REGION_COLUMNS * REGION_COLUMNS
-        last = min(-(-(block.col + block.width) // REGION_COLUMNS) * REGION_COLUMNS, self.scene.grid.shape[1])
+        columns = max(1, REGION_COLUMNS // block.width) * block.width
+        first = block.col // columns * columns
+        last = min(-(-(block.col + block.width) // columns) * columns, self.scene.grid.shape[1])
         place = Block(block.row, first, block.height, last - first)
         region = self._regions.pop(place, None) or Region(place, *self._cones(place))
         self._regions[place] = region
@@ -123,9 +127,12 @@ class Reach:
             np.meshgrid(edges[0][part], edges[1][part], indexing="ij") for part in (np.s_[:-1], np.s_[1:])
         )
         corner_rows, corner_cols = np.stack([top, top, bottom, bottom]), np.stack([left, right, right, left])
-        x, y = self.scene.grid.xy(corner_rows.reshape(4, -1), corner_cols.reshape(4, -1))
-        vectors, off_deg = self.fan(x, y, self.height_m)
-        vectors, off_deg = vectors.reshape(3, *corner_rows.shape), off_deg.reshape(top.shape)
+        vectors, off_deg = np.empty((3, *corner_rows.shape)), np.empty(top.shape)
+        for start in range(0, top.shape[1], FAN_PATCHES):
+            part = np.s_[..., start : start + FAN_PATCHES]
+            x, y = self.scene.grid.xy(corner_rows[part].reshape(4, -1), corner_cols[part].reshape(4, -1))
+            found, off = self.fan(x, y, self.height_m)
+            vectors[part], off_deg[part] = found.reshape(vectors[part].shape), off.reshape(off_deg[part].shape)
         vectors = vectors / np.sqrt((vectors**2).sum(axis=0))
         axis = vectors.sum(axis=1)
         axis = axis / np.sqrt((axis**2).sum(axis=0))
@@ -134,26 +141,25 @@ class Reach:
         center = self.scene.sun.center.reshape(3, 1, 1)
         return Cones(np.broadcast_to(center, axis.shape), of_sun), Cones(axis, spread)
 
-    def _reached(self, region: "Region", row: int) -> Array:
-        """The patches that a material may reach, or in which it may not be assessed: bool."""
+    def _may_reach(self, region: "Region", row: int) -> Array:
+        """The patches that the lobe of a material may reach, or in which it may not be assessed: bool."""
         surface, parameters, rules = self.scene.materials[row - 1]
         low, high = surface.zenith_range_deg[0], steepest_deg(surface, rules)
-        reached = np.maximum(region.zenith_i[1], region.zenith_r[1]) >= high - ROUNDING_DEG
+        uncertain = np.maximum(region.zenith_i[1], region.zenith_r[1]) >= high - ROUNDING_DEG
         if low > 0:
             lowest = np.minimum(region.zenith_i[0], region.zenith_r[0])
-            reached = reached | (np.cos(np.deg2rad(lowest)) > np.cos(np.deg2rad(low)) * (1 - ROUNDING))
+            uncertain |= np.cos(np.deg2rad(lowest)) > np.cos(np.deg2rad(low)) * (1 - ROUNDING)
         gain = np.pi * np.asarray(rules.direct_fraction) * parameters.t1
         bands = np.unique(np.stack([gain, parameters.w, parameters.n, parameters.k]), axis=1)
-        gain, w, n, k = bands[..., None, None]
+        gain, w, n, k = bands[:, bands[0] > 0, None, None]
         bound = f_spec_bound(
             region.zenith_i, region.zenith_r, region.phi, w, n, k, simplified=rules.form == "simplified"
         )
-        bound = np.where(gain > 0, gain * bound, 0)  # and not 0 times inf
-        return reached | np.any(bound >= rules.negligible_reflectance * (1 - ROUNDING), axis=0)
+        return uncertain | np.any(gain * bound >= rules.negligible_reflectance * (1 - ROUNDING), axis=0)
 
 
 class Region:
-    """An area of patches, for which the bound is worked out at once: alone most of its time would go into overhead.
+    """Patches of several blocks, whose bounds are worked out together: for one alone most of the time is overhead.
 
     All arrays are of patches, (rows, cols).
     """
@@ -169,7 +175,7 @@ class Region:
         """lowest and highest relative azimuth"""
         self.attenuated = _attenuated(sun, view)
         """where G is certainly 1 (False), and where it certainly is less (True)"""
-        self.reached: dict[int, Array] = {}
+        self.may_reach: dict[int, Array] = {}
         """by row of the corrector"""
 
     def patches(self, block: Block) -> slice:

@@ -26,6 +26,10 @@ LEAST_SEEN = 0.7
 """share of the scene that a trajectory must pass; image corners beyond a line's end hold no data"""
 SAMPLES = 9
 """a scene is looked at in SAMPLES x SAMPLES points before work starts"""
+NEARLY_M = 1e-6
+"""more than a distance along the track errs by, in coordinates of maps"""
+SAMPLES_AT_ONCE = 4096
+"""of a trajectory, for each of those points"""
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,18 @@ class LineView(View):
         order = np.argsort((away**2).sum(axis=0), kind="stable")
         return seconds[order], unit(*away[:, order])
 
+    def _passes_of_each(self, points: Array) -> list[tuple[Array, Array]]:
+        """`_passes_of` for each of some points (3, ...)."""
+        candidates, points = self._candidates(*points), points.reshape(3, -1)
+        position, forward = self.path.table[:3], self.path.table[3:]
+        offset = (position * forward).sum(axis=0)[:, None]
+        passed = [np.zeros((0, points.shape[1]), np.bool_)]
+        for k in np.array_split(candidates, candidates.size // SAMPLES_AT_ONCE + 1):
+            before, after = (forward[:, sample].T @ points - offset[sample] for sample in (k, k + 1))
+            passed.append((before > -NEARLY_M) & (after <= NEARLY_M))
+        maybe = np.concatenate(passed)
+        return [self._passes_of(point, candidates[maybe[:, i]]) for i, point in enumerate(points.T)]
+
     def straight(self, grid: Grid) -> tuple[Array, Array] | None:
         """Two points (3,) of the trajectory if it is straight over the grid, its scan planes upright across it.
 
@@ -141,12 +157,11 @@ class LineView(View):
     def span(self, grid: Grid, height_m: float) -> tuple[float, float, float]:
         """When the first, the middle and the last point of a level grid were seen, in seconds of the trajectory.
 
+        To a small part of a step: as if scan planes turned evenly between samples, and nothing is compiled for it.
         Points that no scan plane goes over are left out. Raises InputError where that is all of them.
         """
-        points = np.stack([*_lattice(grid), np.full((SAMPLES, SAMPLES), height_m)])
-        candidates = self._candidates(*points)
-        passes = (self._passes_of(point, candidates)[0] for point in points.reshape(3, -1).T)
-        seconds = np.array([next(iter(times), np.nan) for times in passes]).reshape(SAMPLES, SAMPLES)
+        passes = self._passes_of_each(np.stack([*_lattice(grid), np.full((SAMPLES, SAMPLES), height_m)]))
+        seconds = np.array([next(iter(times), np.nan) for times, _ in passes]).reshape(SAMPLES, SAMPLES)
         seen = seconds[np.isfinite(seconds)]
         if not seen.size:
             raise InputError(
@@ -167,9 +182,7 @@ class LineView(View):
         """The trajectory must pass the grid, above it, and only once."""
         path = self.trajectory
         x, y = _lattice(grid)
-        z = np.full_like(x, min(highest_m, float(path.z.min()) - 1))
-        candidates = self._candidates(x, y, z)
-        passes = [self._passes_of(point, candidates) for point in np.stack([x, y, z]).reshape(3, -1).T]
+        passes = self._passes_of_each(np.stack([x, y, np.full_like(x, min(highest_m, float(path.z.min()) - 1))]))
         seen = sum(seconds.size > 0 for seconds, _ in passes) / len(passes)
         if seen < LEAST_SEEN:
             raise InputError(

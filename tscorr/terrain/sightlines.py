@@ -3,7 +3,7 @@
 Between two samples the surface is a straight line, or, where that is steeper than `WALL_SLOPE`, a
 wall midway. Ray states are float32 heights above an origin; positions are float64 until what is left
 is a fraction of a pixel. Nothing is allocated in the sweeps, results and scratch memory are given to them: that halves
-what there is to compile. Imports nothing of ours: numba's cache does not see edits in other files.
+what there is to compile. Calls nothing of other files: numba's cache does not see edits there.
 """
 
 import math
