@@ -312,6 +312,14 @@ def test_the_plan_says_what_a_threshold_would_skip(tmp_path, negligible):
     assert 0 < pixels < 1 or negligible == 0.9
 
 
+def test_no_quantile_of_the_share_is_above_the_largest(tmp_path):
+    """Whole numbers without a scale, of which next to nothing is removed: less than half a bin of the histogram."""
+    write_inputs(tmp_path)
+    report, _ = run(write_config(tmp_path, {"scale": 1.0}, **METAL_ONLY, correction={"negligible_reflectance": 0.01}))
+    share = report["materials"]["red_aluminum"]["specular_share"]
+    assert 0 < share["p50"] <= share["p95"] <= share["max"] < 0.0025
+
+
 def test_the_plan_of_a_surface_model_looks_at_its_slopes(tmp_path):
     """The gable turns half of the metal away from the camera, and half of it more into the peak or out of it."""
     write_inputs(tmp_path)

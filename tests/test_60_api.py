@@ -102,3 +102,9 @@ TILE = {1: "roof_tile"}
 def test_what_correct_refuses(arguments, message):
     with pytest.raises((InputError, MaterialError), match=message):
         tscorr.correct(*arguments)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1e-4, np.nan])
+def test_correct_refuses_a_scale_that_is_none(scale):
+    with pytest.raises(InputError, match="scale = .*; allowed is a number above 0"):
+        tscorr.correct(IMAGE, CLASSES, TILE, *PEAK, scale=scale)

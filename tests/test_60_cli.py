@@ -145,6 +145,15 @@ BAD = {
         narrow_material,
         ["'narrow'", "narrow.toml", "covers 0.5 to 0.6 um", "0.475 um", "image.tif"],
     ),
+    "wavelengths in nanometres": (
+        changed_scene(wavelength_um=[475, 560, 668]),
+        ["wavelength_um = 475", "image.tif", "up to 100", "550 nm is 0.55"],
+    ),
+    "negative scale": (changed_scene(scale=-1e-4), ["image.tif has the scale -0.0001", "above 0"]),
+    "one class twice": (
+        lambda folder: small_scene(folder, materials={"classes": {"1": "roof_tile", "01": "red_aluminum"}}),
+        ["city.toml", "materials.classes", "names 1 more than once"],
+    ),
     "unknown wavelengths": (narrow_material_without_wavelengths, ["'narrow'", "wavelength_um", "image.tif"]),
     "no overlap of the class map": (
         changed_file(lambda folder: write_raster(folder / "class_map.tif", class_map(), west=10000.0)),

@@ -163,6 +163,17 @@ def test_where_the_kernel_is_compiled_no_scene_makes_a_sample(tmp_path, monkeypa
     assert scene.state == "done", scene.error
 
 
+def test_python_ends_in_silence_where_pictures_were_made_before_something_was_compiled():
+    """As in a batch whose last scene alone has a line scanner."""
+    code = (
+        "import OpenImageIO\nfrom numba.core.event import trigger_event\n"
+        "from tscorr.cli.common import compilation_told\n"
+        "with compilation_told(enabled=False), trigger_event('numba:compile', data={}): pass"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stderr == ""
+
+
 def test_a_wait_for_the_other_process_is_told(monkeypatch):
     monkeypatch.setattr(ahead, "_is_new", lambda: True)
     monkeypatch.setattr(ahead, "another", lambda _: {"args": ["sleep", "0.2"]})

@@ -77,6 +77,10 @@ def test_options_of_fit(measured, tmp_path):
 def test_what_cannot_be_fitted_is_refused(measured, tmp_path):
     config = small_scene(tmp_path)
     assert "give files of measurements, or --scenes CONFIG\n" in refused("fit")
+    before = measured.read_bytes()
+    assert f"{measured} is one of the files of measurements" in refused("fit", measured, "-o", measured)
+    assert measured.read_bytes() == before
+    assert "nowhere is not a folder" in refused("fit", measured, "-o", tmp_path / "nowhere" / "m.toml")
     assert "not both" in refused("fit", measured, "--scenes", config)
     assert "--k = 'much'; allowed is a number or 'free'" in refused("fit", measured, "--k", "much")
     assert "--wavelengths = 'red'" in refused("fit", measured, "--wavelengths", "0.55,red")
@@ -157,11 +161,20 @@ def test_width_reads_libraries_and_draws(tmp_path):
     assert "lambertian" not in drawn
 
 
+def test_bench_and_figures_refuse_what_cannot_be_written_before_they_start(tmp_path, monkeypatch):
+    monkeypatch.setattr("tscorr.bench.bench", lambda **_: pytest.fail("started"))
+    assert "b.xyz cannot be written; allowed are files that end in" in refused("bench", "--plot", tmp_path / "b.xyz")
+    assert "nowhere is not a folder" in refused("bench", "--json", tmp_path / "nowhere" / "b.json")
+    (tmp_path / "file").touch()
+    assert f"the folder {tmp_path}/file/figures cannot be made" in refused("figures", tmp_path / "file" / "figures")
+
+
 def test_width_refuses_what_it_does_not_know(tmp_path):
     assert "no material 'rooftile' (did you mean 'roof_tile'?)" in refused("width", "rooftile")
     result = run("width", "roof_tile", "--plot", tmp_path / "w.doc")
     assert result.exit_code == 2
     assert "w.doc cannot be written" in result.stderr
+    assert "are files that end in .png, .svg, .pdf" in refused("width", "roof_tile", "--plot", tmp_path / "w.jpg")
     assert run("width").exit_code == 2
 
 

@@ -121,6 +121,8 @@ def correct(
     class_map = np.asarray(classes)
     if cube.ndim != 3 or class_map.shape != cube.shape[1:]:
         raise InputError(f"an image of shape {image.shape} and classes of shape {class_map.shape} do not fit")
+    if not (np.isfinite(scale) and scale > 0):
+        raise InputError(f"scale = {scale}; allowed is a number above 0")
     bands, shape = cube.shape[0], cube.shape[1:]
     settings = rules or Rules()
     entries = []

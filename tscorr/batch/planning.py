@@ -80,9 +80,10 @@ def _warn_of_missing_scales(planned: Sequence[Scene]) -> None:
     ]
     if doubtful:
         log.warning(
-            "the image %s%s holds %s values and no scale, so that the least above 0 is 1: give scale = ..., 0.0001 "
-            "where 10000 stands for 1, or scale = 1.0 where that is right",
+            "the image %s%s holds %s values and no scale, so that the least above 0 is 1: give scale = ..., %s "
+            "stands for 1, or scale = 1.0 where that is right",
             doubtful[0].path,
             f", like {len(doubtful) - 1} more," if len(doubtful) > 1 else "",
             doubtful[0].dtype,
+            "0.004 where 250" if doubtful[0].dtype.itemsize == 1 else "0.0001 where 10000",
         )

@@ -13,11 +13,24 @@ from typing import Any
 
 import click
 
-from tscorr.errors import ConfigError, TscorrError, printable
+from tscorr.errors import ConfigError, OutputError, TscorrError, printable
 
 BAD_USAGE = 2
 SIGNALLED = 128
 """exit code of a stop by signal, less the number of the signal"""
+
+
+PICTURES = ".png", ".svg", ".pdf"
+
+
+def can_be_written(option: str, path: Path | None, suffixes: Sequence[str] = ()) -> None:
+    """Raise OutputError, before any work, where a file to be written has no folder or a suffix that is not allowed."""
+    if path is None:
+        return
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise OutputError(f"{option} {path} cannot be written; allowed are files that end in {', '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise OutputError(f"{option} {path} cannot be written: {path.parent} is not a folder")
 
 
 class Stopped(KeyboardInterrupt):
@@ -87,7 +100,8 @@ def compilation_told(*, enabled: bool = True) -> Iterator[None]:
     """One line on stderr when the first function is compiled; what an earlier run has compiled is not.
 
     From then on the garbage collector leaves alone what there was: the modules, which stay, and which it would search
-    again and again while numba makes its many objects, for a fifth of the time.
+    again and again while numba makes its many objects, for a fifth of the time. Afterwards it has them back: what it
+    never sees again OpenImageIO takes for lost when Python ends, and says so in forty lines.
     """
     from numba.core.event import RecordingListener, install_listener
 
@@ -99,8 +113,11 @@ def compilation_told(*, enabled: bool = True) -> Iterator[None]:
                     click.echo(COMPILING, err=True)
             super().on_start(event)
 
-    with install_listener("numba:compile", Teller()):
-        yield
+    try:
+        with install_listener("numba:compile", Teller()):
+            yield
+    finally:
+        gc.unfreeze()
 
 
 config_argument = click.argument("config", type=click.Path(exists=True, dir_okay=False, path_type=Path))

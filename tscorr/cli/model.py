@@ -5,7 +5,8 @@ from pathlib import Path
 
 import click
 
-from tscorr.cli.common import with_clear_errors
+from tscorr.cli.common import PICTURES, can_be_written, with_clear_errors
+from tscorr.errors import OutputError
 
 
 @click.command()
@@ -22,6 +23,8 @@ def bench(json_file: Path | None, plot: Path | None, quick: bool) -> None:
 
     from tscorr import bench
 
+    can_be_written("--json", json_file)
+    can_be_written("--plot", plot, PICTURES)
     result = bench.bench(quick=quick)
     click.echo(bench.table(result))
     if json_file is not None:
@@ -41,6 +44,9 @@ def figures(folder: Path) -> None:
     """Draw figures 1 to 5 of the paper, from the model alone, into FOLDER."""
     from tscorr.bench import draw_figures
 
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the folder {folder} cannot be made: {error.strerror}") from None
     for path in draw_figures(folder):
         click.echo(path)

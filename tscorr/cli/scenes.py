@@ -154,7 +154,7 @@ def plan(config: Path, as_json: bool) -> None:
         )
         for row in entry["negligible"]:
             click.echo(
-                f"  negligible_reflectance = {row['negligible_reflectance']:.2g}{' (as set)' if row['set'] else ''}: "
+                f"  negligible_reflectance = {row['negligible_reflectance']:.2g}{' (in use)' if row['set'] else ''}: "
                 f"nothing to remove in about {100 * row['pixels']:.1f} % of the pixels, {100 * row['blocks']:.0f} % "
                 f"of the blocks"
             )

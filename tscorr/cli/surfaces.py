@@ -7,7 +7,15 @@ from typing import Literal
 
 import click
 
-from tscorr.cli.common import form_option, library_option, number, print_table, with_clear_errors
+from tscorr.cli.common import (
+    PICTURES,
+    can_be_written,
+    form_option,
+    library_option,
+    number,
+    print_table,
+    with_clear_errors,
+)
 from tscorr.cli.scenes import progress_bars
 from tscorr.errors import ConfigError
 
@@ -62,6 +70,7 @@ def fit(
     """Fit materials to goniometer FILES (.csv, .brdf), or to the scenes of a configuration."""
     if (config is None) == (not files):
         raise ConfigError("give files of measurements, or --scenes CONFIG" + (", not both" if files else ""))
+    can_be_written("-o", output)
     held = None if k == "free" else number("--k", k, "a number or 'free'")
     if config is None:
         from tscorr.fit import FitSettings, fit_files
@@ -106,6 +115,7 @@ def width(
     from tscorr.materials import builtin_materials, find, load_materials
     from tscorr.width import crossover_incidence, width_rows
 
+    can_be_written("--plot", plot, PICTURES)
     known = dict(builtin_materials())
     for path in libraries:
         known.update(load_materials(path))

@@ -176,6 +176,17 @@ class Materials(Section):
     classes: dict[int, str] = Field(description="value in the class map = material")
     settings: dict[str, MaterialSettings] = Field({}, description="settings of one material")
 
+    @field_validator("classes", mode="before")
+    @classmethod
+    def _classes_are_named_once(cls, classes: Any) -> Any:
+        """TOML takes 1 and 01 for two keys."""
+        if isinstance(classes, dict):
+            values = [int(key) for key in classes if str(key).strip().lstrip("+-").isdecimal()]
+            for value in values:
+                if values.count(value) > 1:
+                    raise ValueError(f"names {value} more than once; allowed is one material for each class")
+        return classes
+
 
 class Sun(Section):
     """`sun`: a time, or a direction."""

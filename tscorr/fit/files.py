@@ -38,6 +38,8 @@ def fit_files(
 
     Raises InputError naming the file where one cannot be read or fitted; then nothing is written.
     """
+    if output is not None and Path(output).resolve() in {Path(path).resolve() for path in paths}:
+        raise InputError(f"the material file {output} is one of the files of measurements; allowed is another name")
     settings = settings or FitSettings()
     results = {
         key: fit_measurements(measured if wavelengths_um is None else measured.at(wavelengths_um), settings, key)

@@ -128,6 +128,7 @@ def _material(facts: SceneFacts, row: int, path: Array | None) -> dict[str, Any]
     rules, lobe, tally = facts.materials[row][2], facts.lobe(row), facts.tally
     states, extremes = tally.states[row + 1], tally.extremes[row + 1]
     incidence, tilt, share = tally.incidence[row + 1], tally.tilt[row + 1], tally.share[row + 1]
+    most = extremes[1] if share.any() else 1.0
     level_width_deg = float(azimuthal_width(lobe, facts.solar_zenith_deg, form=rules.form))
     return {
         "pixels": states.sum(),
@@ -139,8 +140,8 @@ def _material(facts: SceneFacts, row: int, path: Array | None) -> dict[str, Any]
             "p50": quantile(tilt, 0.5, TILT_BIN_DEG),
         },
         "specular_share": {
-            "p50": np.minimum(1, quantile(share, 0.50, SHARE_BIN)),
-            "p95": np.minimum(1, quantile(share, 0.95, SHARE_BIN)),
+            "p50": np.minimum(most, quantile(share, 0.50, SHARE_BIN)),
+            "p95": np.minimum(most, quantile(share, 0.95, SHARE_BIN)),
             "max": extremes[1] if share.any() else None,
             "above": _shares_above(share, incidence.sum()),
         },

@@ -10,6 +10,9 @@ from tscorr.errors import ConfigError, InputError, MaterialError
 from tscorr.materials import BandParameters, Material
 from tscorr.scene.bad_bands import parameters_of
 
+LONGEST_UM = 100.0
+"""beyond it a number is no wavelength of a band in micrometres"""
+
 
 def at_bands(surface: Material, wavelengths: tuple[float, ...] | None, image: rasters.RasterInfo) -> BandParameters:
     """The parameters of a material in each band."""
@@ -24,6 +27,12 @@ def wavelengths_of(settings: config.Scene, image: rasters.RasterInfo) -> tuple[f
     given = settings.wavelength_um
     if given is None:
         return image.wavelengths_um
+    for um in _per_band(given, image, "wavelength_um"):
+        if not 0 < um <= LONGEST_UM:
+            raise ConfigError(
+                f"wavelength_um = {um:g} of the image {image.path}; allowed are micrometres, above 0 and up to "
+                f"{LONGEST_UM:g}: 550 nm is 0.55"
+            )
     return _per_band(given, image, "wavelength_um")
 
 
@@ -45,8 +54,8 @@ def stored_of(settings: config.Scene, correction: config.Correction, image: rast
     offset = image.offsets if settings.offset is None else _per_band(settings.offset, image, "offset")
     for name, values in (("scale", scale), ("offset", offset)):
         for value in values:
-            if not np.isfinite(value) or (name == "scale" and value == 0):
-                allowed = "any number but 0" if name == "scale" else "any number"
+            if not np.isfinite(value) or (name == "scale" and value <= 0):
+                allowed = "a number above 0" if name == "scale" else "any number"
                 raise InputError(
                     f"the image {image.path} has the {name} {value:g}; allowed is {allowed}: give {name} = ..."
                 )
