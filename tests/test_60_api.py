@@ -106,5 +106,5 @@ def test_what_correct_refuses(arguments, message):
 
 @pytest.mark.parametrize("scale", [0.0, -1e-4, np.nan])
 def test_correct_refuses_a_scale_that_is_none(scale):
-    with pytest.raises(InputError, match="scale = .*; allowed is a number above 0"):
+    with pytest.raises(InputError, match=r"scale = .*; allowed is a number above 0"):
         tscorr.correct(IMAGE, CLASSES, TILE, *PEAK, scale=scale)

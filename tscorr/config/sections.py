@@ -103,7 +103,7 @@ class Correction(Section):
         "best", description="what becomes of a pixel whose share is above the limit"
     )
     uncorrectable_share: Annotated[float, Field(gt=0, le=1)] = Field(
-        0.9, description="largest part of the signal that may be removed"
+        0.9, description="part of the signal; where more would be removed the pixel is uncorrectable"
     )
     max_zenith_deg: Annotated[float, Field(gt=0, lt=90)] | None = Field(
         None, description="largest incidence and exitance; default 85, 70 with the simplified form"
