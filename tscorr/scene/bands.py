@@ -27,13 +27,14 @@ def wavelengths_of(settings: config.Scene, image: rasters.RasterInfo) -> tuple[f
     given = settings.wavelength_um
     if given is None:
         return image.wavelengths_um
-    for um in _per_band(given, image, "wavelength_um"):
+    wavelengths = _per_band(given, image, "wavelength_um")
+    for um in wavelengths:
         if not 0 < um <= LONGEST_UM:
             raise ConfigError(
                 f"wavelength_um = {um:g} of the image {image.path}; allowed are micrometres, above 0 and up to "
                 f"{LONGEST_UM:g}: 550 nm is 0.55"
             )
-    return _per_band(given, image, "wavelength_um")
+    return wavelengths
 
 
 def _per_band(value: float | Sequence[float], image: rasters.RasterInfo, what: str) -> tuple[float, ...]:

@@ -173,7 +173,8 @@ class Region:
         turn = sun.azimuth_spread_deg + view.azimuth_spread_deg
         self.phi = np.maximum(phi - turn, 0), np.minimum(phi + turn, 180)
         """lowest and highest relative azimuth"""
-        self.attenuated = _attenuated(sun, view)
+        apart, unsure = angle_between(sun.axis, view.axis), sun.spread_deg + view.spread_deg
+        self.attenuated = _attenuated(self.zenith_i, self.zenith_r, apart - unsure, apart + unsure)
         """where G is certainly 1 (False), and where it certainly is less (True)"""
         self.may_reach: dict[int, Array] = {}
         """by row of the corrector"""
@@ -184,19 +185,19 @@ class Region:
         return slice(min(first // PATCH_PX, self.unknown.shape[1] - 1), last // PATCH_PX + 1)
 
 
-def _attenuated(sun: Cones, view: Cones) -> dict[bool, Array]:
+def _attenuated(
+    zenith_i: tuple[Array, Array], zenith_r: tuple[Array, Array], nearest_deg: Array, farthest_deg: Array
+) -> dict[bool, Array]:
     """Where G is certainly 1 (False), and where it certainly is less (True).
 
-    G is 1 where min(ci, cr) (ci + cr) >= cos^2 of half the angle between sun and view.
+    G is 1 where min(ci, cr) (ci + cr) >= cos^2 of half the angle between sun and view, which lies between two limits.
     """
-    apart = angle_between(sun.axis, view.axis)
-    unsure = sun.spread_deg + view.spread_deg
-    (low_i, high_i), (low_r, high_r) = sun.zenith_deg, view.zenith_deg
+    (low_i, high_i), (low_r, high_r) = zenith_i, zenith_r
     least = _lesser_times_sum(high_i, high_r)
     most = _lesser_times_sum(low_i, low_r)
     return {
-        False: least > _cos2_half(np.maximum(apart - unsure, 0)) * (1 + ROUNDING),
-        True: most < _cos2_half(np.minimum(apart + unsure, 180)) * (1 - ROUNDING),
+        False: least > _cos2_half(np.maximum(nearest_deg, 0)) * (1 + ROUNDING),
+        True: most < _cos2_half(np.minimum(farthest_deg, 180)) * (1 - ROUNDING),
     }
 
 
