@@ -476,6 +476,19 @@ def test_how_a_scene_is_cut_changes_nothing(dtype, tile):
             np.testing.assert_array_equal(sums, getattr(whole.tally, name), err_msg=name)
 
 
+def test_where_no_image_was_read_flags_and_sums_are_the_same():
+    corrector, inputs = corrector_of("uint16"), city_inputs("uint16")
+    inputs.material[:3] = 0
+    known = replace(inputs, shadowed=None, hidden=None)
+    unread = replace(known, image=np.empty((0, *inputs.material.shape), np.uint16))
+    read, told = corrector.passed_through(known), corrector.passed_through(unread)
+    none = PixelFlag.NO_MATERIAL | SpecularState.NOT_ASSESSED << 6
+    np.testing.assert_array_equal(told.flags, np.where(inputs.material == 0, none, 0))
+    np.testing.assert_array_equal(told.flags, read.flags)
+    for name, sums in read.tally._asdict().items():
+        np.testing.assert_array_equal(getattr(told.tally, name), sums, err_msg=name)
+
+
 def test_the_tally_counts_every_pixel():
     result = corrector_of("uint16")(city_inputs("uint16"))
     states, counts = specular_state(result.flags), result.tally.states

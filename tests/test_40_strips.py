@@ -19,6 +19,7 @@ from small_scene import (
 
 from tscorr import batch, publish, rasters
 from tscorr.config import load_config
+from tscorr.correction import FLAG_VALUES
 from tscorr.errors import InputError
 from tscorr.scene import correct, strips
 from tscorr.scene.overlap import overlaps
@@ -181,7 +182,7 @@ def test_sums_survive_their_way_through_json(inputs):
     scene = planned(inputs, "sums")
     sums = Sums(len(scene.materials), BANDS)
     rng = np.random.default_rng(1)
-    sums.flags[rng.integers(0, 1 << 16, 50)] = 2**53 + 1
+    sums.flags[rng.integers(0, FLAG_VALUES, 50)] = 2**53 + 1
     for values in sums.tally:
         values[...] = rng.integers(0, 2**62, values.shape) if values.dtype.kind == "i" else rng.random(values.shape)
     again = Sums(len(scene.materials), BANDS)

@@ -30,7 +30,7 @@ import numpy as np
 from numba.core.event import RecordingListener, install_listener
 from tscorr.scene.compiled import count_values
 with install_listener("numba:compile", RecordingListener()) as heard:
-    count_values(np.zeros((2, 2), np.uint16), np.zeros(1 << 16, np.int64))
+    count_values(np.zeros((2, 2), np.uint16), np.zeros(8192, np.int64))
 print(len(heard.buffer))
 """
 

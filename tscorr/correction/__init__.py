@@ -2,11 +2,12 @@
 
 from tscorr.correction.corrector import BlockInputs, BlockResult, Corrector, class_rows
 from tscorr.correction.extras import check_ratio, is_extra
-from tscorr.correction.flags import SINGLE_FLAGS, PixelFlag, SpecularState, specular_state
+from tscorr.correction.flags import FLAG_VALUES, SINGLE_FLAGS, PixelFlag, SpecularState, specular_state
 from tscorr.correction.rules import NEGLIGIBLE_REFLECTANCE, ReferenceDirections, Rules, Stored
 from tscorr.correction.tables import add_angles, add_tally, new_tally, steepest_deg
 
 __all__ = [
+    "FLAG_VALUES",
     "NEGLIGIBLE_REFLECTANCE",
     "SINGLE_FLAGS",
     "BlockInputs",

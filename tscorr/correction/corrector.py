@@ -12,7 +12,7 @@ from tscorr import kernels
 from tscorr.correction import oracle
 from tscorr.correction.ahead import compiling
 from tscorr.correction.extras import extras_table, is_extra, signed
-from tscorr.correction.flags import PixelFlag
+from tscorr.correction.flags import SPECULAR_STATE_SHIFT, PixelFlag, SpecularState
 from tscorr.correction.rules import Stored
 from tscorr.correction.tables import (
     Entry,
@@ -24,6 +24,9 @@ from tscorr.correction.tables import (
 from tscorr.errors import InputError
 
 Array = NDArray[Any]
+
+
+UNKNOWN_MATERIAL = PixelFlag.NO_MATERIAL | SpecularState.NOT_ASSESSED << SPECULAR_STATE_SHIFT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,10 +175,21 @@ class Corrector:
 
         The flags of pixels that are lit, seen, and neither hidden nor too steep, as the correction gives them.
         """
-        idle = replace(self._engines[0], table=self._engines[0].table._replace(peak=np.zeros_like(self.peaks)))
         results = self._results(inputs, everywhere=inputs.image.shape, want_removed=False)
-        self._run(idle, inputs, results, 0)
+        if len(inputs.image) == 0 and inputs.low_confidence is None:
+            self._set_states(inputs.material, results)
+        else:
+            idle = replace(self._engines[0], table=self._engines[0].table._replace(peak=np.zeros_like(self.peaks)))
+            self._run(idle, inputs, results, 0)
         return self._result(inputs, results, want_removed=False)
+
+    def _set_states(self, material: Array, results: "_Results") -> None:
+        """The flags of a block that follow from its materials alone: negligible, or none that is known."""
+        unknown = material == 0
+        results.flags[unknown] = UNKNOWN_MATERIAL
+        results.tally.states[0, SpecularState.NOT_ASSESSED] = np.count_nonzero(unknown)
+        for row in range(1, len(results.tally.states)):
+            results.tally.states[row, SpecularState.NEGLIGIBLE] = np.count_nonzero(material == row)
 
     def __call__(self, inputs: BlockInputs, *, first_row: int = 0, want_removed: bool = True) -> BlockResult:
         """The block without its specular part; `inputs.image` is changed in place."""

@@ -30,6 +30,8 @@ class PixelFlag(IntFlag):
 
 
 SPECULAR_STATE_SHIFT = 6
+FLAG_VALUES = 2 * max(PixelFlag)
+"""a pixel's flags are below this"""
 SINGLE_FLAGS = tuple(flag for flag in PixelFlag if flag is not PixelFlag.SPECULAR_STATE)
 
 

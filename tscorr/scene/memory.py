@@ -43,7 +43,8 @@ def share() -> None:
 
 def keep_below(limit_mb: float) -> None:
     """Give back what is free where this process takes nearly as much as it may. [MB]"""
-    if rss_mb() > max(limit_mb - HEADROOM_MB, _left["mb"] + WORTH_MB):
+    threshold = max(limit_mb - HEADROOM_MB, _left["mb"] + WORTH_MB)
+    if peak_rss_mb() > threshold and rss_mb() > threshold:  # the peak is asked in a hundredth of the time
         give_back()
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tscorr.correction import SINGLE_FLAGS, BlockResult, add_tally, new_tally
+from tscorr.correction import FLAG_VALUES, SINGLE_FLAGS, BlockResult, add_tally, new_tally
 from tscorr.correction.sigmas import SigmaTally
 
 Array = NDArray[Any]
@@ -20,7 +20,8 @@ class Sums:
 
     def __init__(self, materials: int, bands: int) -> None:
         self.tally = new_tally(materials + 1, bands)
-        self.flags = np.zeros(1 << 16, np.int64)
+        self.flags = np.zeros(FLAG_VALUES, np.int64)
+        """pixels with each value of the flags"""
         self.sigmas = SigmaTally(materials + 1)
         self.skipped = dict.fromkeys(
             ("blocks", "blocks_no_specular_material", "blocks_out_of_reach", "blocks_shadow_or_nodata"), 0
@@ -34,7 +35,7 @@ class Sums:
         """Add a block of these rows of the corrector; `kind` says why most of its work was skipped, if it was."""
         from tscorr.scene.compiled import count_values
 
-        counts, sigmas = np.zeros(1 << 16, np.int64), None
+        counts, sigmas = np.zeros_like(self.flags), None
         count_values(result.flags, counts)
         if result.sigma is not None:
             sigmas = SigmaTally(len(self.sigmas.touched))
