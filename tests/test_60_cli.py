@@ -147,7 +147,7 @@ BAD = {
     ),
     "wavelengths in nanometres": (
         changed_scene(wavelength_um=[475, 560, 668]),
-        ["wavelength_um = 475", "image.tif", "up to 100", "550 nm is 0.55"],
+        ["wavelength_um = 475", "image.tif", "0.1 to 100 um (550 nm are 0.55 um)"],
     ),
     "negative scale": (changed_scene(scale=-1e-4), ["image.tif has the scale -0.0001", "above 0"]),
     "one class twice": (

@@ -32,7 +32,7 @@ from small_scene import (
 
 from tscorr.cli import cli
 from tscorr.config import FILL_IN, Config, template
-from tscorr.config.sections import SURFACES, VIEWS
+from tscorr.config.scenes import SURFACES, VIEWS
 from tscorr.correction import SpecularState, specular_state
 
 ROOT = Path(__file__).parent.parent

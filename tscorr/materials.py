@@ -23,6 +23,14 @@ FITTED = ("t0", "t1", "w", "n")
 """The order of a covariance matrix: k is held fixed in a fit."""
 
 
+ALLOWED_WAVELENGTHS = "0.1 to 100 um (550 nm are 0.55 um)"
+
+
+def is_wavelength(um: Any) -> Any:
+    """Whether a number, or each one of an array, can be the wavelength of a band in micrometres."""
+    return (um >= 0.1) & (um <= 100)
+
+
 @dataclass(frozen=True, slots=True)
 class Material:
     """One surface: f_r = t0 + t1 f_spec, at one wavelength, at several, or at all.
@@ -238,8 +246,8 @@ class _Check:
 
     def wavelengths(self) -> None:
         wavelengths = self.material.wavelength_um
-        if any(not 0.1 <= value <= 100 for value in wavelengths):
-            self.fail("wavelength_um", list(wavelengths), "0.1 to 100 um")
+        if not all(map(is_wavelength, wavelengths)):
+            self.fail("wavelength_um", list(wavelengths), ALLOWED_WAVELENGTHS)
         if any(b <= a for a, b in pairwise(wavelengths)):
             self.fail("wavelength_um", list(wavelengths), "an ascending list")
 

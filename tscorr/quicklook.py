@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tscorr.errors import InputError, OutputError
 from tscorr.eye import eye
+from tscorr.materials import ALLOWED_WAVELENGTHS, is_wavelength
 
 Array = NDArray[np.float32]
 Style = Literal["true_colour", "false_colour"]
@@ -50,9 +51,9 @@ def rgb_matrix(wavelengths_um: ArrayLike, fwhm_um: ArrayLike | None = None, styl
     widths = np.full(centres.shape, np.nan) if fwhm_um is None else np.atleast_1d(np.asarray(fwhm_um, float))
     if widths.shape != centres.shape:
         raise InputError(f"{widths.size} band widths for {centres.size} wavelengths; one a band is needed")
-    strange = centres[(centres <= 0) | (centres > 100)]
+    strange = centres[~(np.isnan(centres) | is_wavelength(centres))]
     if strange.size:
-        raise InputError(f"band wavelength {strange[0]:g} um; above 0 and up to 100 um is allowed")
+        raise InputError(f"band wavelength {strange[0]:g} um; allowed is {ALLOWED_WAVELENGTHS}")
     matrix = np.zeros((centres.size, 3))
     shown = shown_bands(centres)
     if style == "false_colour":

@@ -1,17 +1,13 @@
 """The configuration: a TOML file as pydantic models, checked before any work starts."""
 
 from tscorr.config.loading import absolute, load_config
-from tscorr.config.sections import (
+from tscorr.config.scenes import (
     AnglesViewSettings,
-    Config,
     ConstantViewSettings,
-    Correction,
     DsmSettings,
     FlatSettings,
     FrameViewSettings,
     LineViewSettings,
-    MaterialSettings,
-    Model,
     MosaicViewSettings,
     NormalsSettings,
     ObsSurfaceSettings,
@@ -20,6 +16,7 @@ from tscorr.config.sections import (
     Sun,
     Truth,
 )
+from tscorr.config.sections import Config, Correction, MaterialSettings, Model
 from tscorr.config.template import FILL_IN, json_schema, template
 
 __all__ = [

@@ -10,7 +10,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tscorr.config.sections import SURFACES, TABLES, VIEWS, Config, Scene
+from tscorr.config.scenes import SURFACES, VIEWS, Scene
+from tscorr.config.sections import TABLES, Config
 from tscorr.config.template import FILL_IN
 from tscorr.errors import ConfigError, nearest
 from tscorr.texts import read_text
@@ -168,6 +169,8 @@ def _problem(path: Path, item: Mapping[str, Any], data: Mapping[str, Any]) -> st
 
 def _as_written(value: Any) -> str:
     """A value about as it stands in the file."""
+    if isinstance(value, bool):
+        return str(value).lower()
     return str(value) if isinstance(value, date | time) else repr(value)
 
 

@@ -6,7 +6,9 @@ from typing import Any, Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from tscorr.config.sections import SURFACES, VIEWS, Config, Scene, Section
+from tscorr.config.fields import Section
+from tscorr.config.scenes import SURFACES, VIEWS, Scene
+from tscorr.config.sections import Config
 from tscorr.materials import builtin_materials
 
 FILL_IN = "FILL IN"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tscorr.errors import InputError, nearest
 from tscorr.fit.measurements import Measurements
+from tscorr.materials import ALLOWED_WAVELENGTHS, is_wavelength
 from tscorr.texts import read_text
 
 Array = NDArray[np.float64]
@@ -175,8 +176,8 @@ def _by_wavelength(
 
 def _check_wavelengths(wavelengths: tuple[float, ...], file: str) -> None:
     for value in wavelengths:
-        if not 0.1 <= value <= 100:
-            raise InputError(f"{file}: wavelength {value:g} um; allowed is 0.1 to 100 (550 nm are 0.55 um)")
+        if not is_wavelength(value):
+            raise InputError(f"{file}: wavelength {value:g} um; allowed is {ALLOWED_WAVELENGTHS}")
 
 
 def _read_cornell(text: str, file: str) -> Measurements:

@@ -7,11 +7,8 @@ import numpy as np
 from tscorr import config, rasters
 from tscorr.correction import NEGLIGIBLE_REFLECTANCE, ReferenceDirections, Rules, Stored
 from tscorr.errors import ConfigError, InputError, MaterialError
-from tscorr.materials import BandParameters, Material
+from tscorr.materials import ALLOWED_WAVELENGTHS, BandParameters, Material, is_wavelength
 from tscorr.scene.bad_bands import parameters_of
-
-LONGEST_UM = 100.0
-"""beyond it a number is no wavelength of a band in micrometres"""
 
 
 def at_bands(surface: Material, wavelengths: tuple[float, ...] | None, image: rasters.RasterInfo) -> BandParameters:
@@ -29,11 +26,8 @@ def wavelengths_of(settings: config.Scene, image: rasters.RasterInfo) -> tuple[f
         return image.wavelengths_um
     wavelengths = _per_band(given, image, "wavelength_um")
     for um in wavelengths:
-        if not 0 < um <= LONGEST_UM:
-            raise ConfigError(
-                f"wavelength_um = {um:g} of the image {image.path}; allowed are micrometres, above 0 and up to "
-                f"{LONGEST_UM:g}: 550 nm is 0.55"
-            )
+        if not is_wavelength(um):
+            raise ConfigError(f"wavelength_um = {um:g} of the image {image.path}; allowed is {ALLOWED_WAVELENGTHS}")
     return wavelengths
 
 
