@@ -11,7 +11,7 @@ from small_scene import small_scene
 
 import tscorr
 from tscorr.angles import unit_vector
-from tscorr.errors import InputError, MaterialError
+from tscorr.errors import ConfigError, InputError, MaterialError
 
 TABLE = json.loads((Path(__file__).parent / "data/paper_values.json").read_text())
 PAPER = [name for name, values in TABLE["materials"].items() if "chi2_df" in values]
@@ -77,6 +77,7 @@ def test_dataarrays_come_back_as_they_went_in():
 
 def test_public_names_are_there():
     assert all(hasattr(tscorr, name) for name in tscorr.__all__)
+    assert set(tscorr.__all__) <= set(dir(tscorr))
     with pytest.raises(AttributeError, match="no attribute 'brfd'"):
         _ = tscorr.brfd
 
@@ -97,11 +98,88 @@ TILE = {1: "roof_tile"}
         ((IMAGE, CLASSES, TILE, PEAK[0], [0, 1]), r"view has the shape \(2,\); allowed are \(3,\) and \(3, 3, 4\)"),
         ((IMAGE, CLASSES, TILE, *PEAK, np.ones((3, 4, 3))), r"normal has the shape \(3, 4, 3\)"),
         ((IMAGE, CLASSES, {1: "rooftile"}, *PEAK), r"no material 'rooftile' \(did you mean 'roof_tile'\?\)"),
+        ((IMAGE, CLASSES, {1: 7}, *PEAK), "materials holds 1: 7; allowed is an integer: a Material, or its name"),
+        ((IMAGE, CLASSES, {"1": "roof_tile"}, *PEAK), "materials holds '1': 'roof_tile'; allowed is an integer"),
     ],
 )
 def test_what_correct_refuses(arguments, message):
     with pytest.raises((InputError, MaterialError), match=message):
         tscorr.correct(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("scale", "x", "a number above 0"),
+        ("offset", np.inf, "a number"),
+        ("nodata", "none", "a number"),
+        ("saturation", np.nan, "a number"),
+        ("image_noise", 0.1, "a, b, none below 0"),
+        ("image_noise", (0.1, -1), "a, b, none below 0"),
+        ("direction_sigma_deg", -1, "an angle from 0 to 45"),
+    ],
+)
+def test_correct_refuses_numbers_that_mean_nothing(name, value, allowed):
+    with pytest.raises(InputError, match=f"{name} = .*; allowed is {allowed}"):
+        tscorr.correct(IMAGE, CLASSES, TILE, *PEAK, **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        (
+            "shadowed",
+            np.zeros((2, 2), bool),
+            r"shadowed is bool of the shape \(2, 2\); allowed are numbers of \(3, 4\)",
+        ),
+        ("hidden", np.zeros((2, 2), bool), r"hidden is bool of the shape \(2, 2\)"),
+        ("weight", np.full((3, 4), 1.5), "weight holds 1.5; allowed is 0 to 1"),
+        ("weight", np.full((3, 4), np.nan), "weight holds nan; allowed is 0 to 1"),
+        ("weight", "x", "weight is <U1"),
+        ("normal_sigma_deg", -1.0, "normal_sigma_deg holds -1; allowed is 0 to 45"),
+        ("normal_sigma_deg", np.full((3, 4), 50.0), "normal_sigma_deg holds 50; allowed is 0 to 45"),
+    ],
+)
+def test_correct_refuses_fields_that_mean_nothing(name, values, message):
+    with pytest.raises(InputError, match=message):
+        tscorr.correct(IMAGE, CLASSES, TILE, *PEAK, **{name: values})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("form", "simple", r"'full', 'simplified' \(did you mean 'simplified'\?\)"),
+        ("method", "substract", r"'subtract', 'ratio', 'reference' \(did you mean 'subtract'\?\)"),
+        ("uncorrectable", None, "'best', 'keep', 'nodata'"),
+        ("direct_fraction", (1.2,), "a list of shares from 0 to 1"),
+        ("direct_fraction", 0.8, "a list of shares from 0 to 1"),
+        ("direct_fraction", (), "a list of shares from 0 to 1"),
+        ("uncorrectable_share", 0, "a share above 0"),
+        ("max_zenith_deg", 90, "an angle above 0 and below 90"),
+        ("negligible_reflectance", np.nan, "a number from 0"),
+        ("reference", (30.0, 80.0, 0.0), "two zenith angles from 0 to 75"),
+        ("reference", (30.0,), "two zenith angles from 0 to 75"),
+        ("normal_sigma_deg", "5", "an angle from 0 to 45"),
+    ],
+)
+def test_rules_refuse_what_they_do_not_know(name, value, allowed):
+    with pytest.raises(ConfigError, match=f"{name} = .*; allowed (is|are) {allowed}"):
+        tscorr.Rules(**{name: value})
+
+
+def test_a_form_that_is_none_is_refused_everywhere():
+    with pytest.raises(ConfigError, match="form = 'half'; allowed are 'full' and 'simplified'"):
+        tscorr.brdf("roof_tile", 50, 50, 180, form="half")
+    with pytest.raises(ConfigError, match="form = 'half'; allowed are 'full' and 'simplified'"):
+        tscorr.azimuthal_width("roof_tile", 50, form="half")
+
+
+def test_widths_take_names_as_brdf_does():
+    angles = [30.0, 50.0, 65.0]
+    named = tscorr.azimuthal_width("roof_tile", angles)
+    np.testing.assert_array_equal(named, tscorr.azimuthal_width(tscorr.material("roof_tile"), angles))
+    with pytest.raises(MaterialError, match=r"no material 'rooftile' \(did you mean 'roof_tile'\?\)"):
+        tscorr.azimuthal_width("rooftile", 30)
 
 
 @pytest.mark.parametrize("scale", [0.0, -1e-4, np.nan])

@@ -244,7 +244,10 @@ BAD = {
         ),
         ["uncorrectable = 'nodata'", "image.tif has no nodata value"],
     ),
-    "direct fraction above one": (changed_scene(direct_fraction=1.2), ["direct_fraction = 1.2;", "0 to 1"]),
+    "direct fraction above one": (
+        changed_scene(direct_fraction=1.2),
+        ["city.toml", "'roofs'.direct_fraction = 1.2", "a share from 0 to 1"],
+    ),
 }
 
 

@@ -50,3 +50,8 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'tscorr' has no attribute '{name}'")
     return getattr(import_module(f"tscorr.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """The public names, imported or not, so that completion finds them."""
+    return sorted({*globals(), *__all__})

@@ -3,15 +3,17 @@
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tscorr import reference
-from tscorr.correction import BlockInputs, Corrector, Rules, Stored, check_ratio, class_rows
-from tscorr.errors import InputError
+from tscorr.correction import BlockInputs, Corrector, Entry, Rules, Stored, check_ratio, class_rows
+from tscorr.errors import InputError, Limits, check_values
 from tscorr.materials import Material, material
+from tscorr.width import is_simplified
 
 Array = NDArray[Any]
 
@@ -39,7 +41,7 @@ def brdf(
     angles = [np.asarray(angle, dtype=float) for angle in (incidence_deg, exitance_deg, relative_azimuth_deg)]
     geometry = reference.geometry_from_angles(*np.broadcast_arrays(*angles))
     t0, t1, w, n, k = (getattr(parameters, name)[0] for name in ("t0", "t1", "w", "n", "k"))
-    f_spec = reference.specular(geometry, w, n, k, simplified=form == "simplified")
+    f_spec = reference.specular(geometry, w, n, k, simplified=is_simplified(form))
     return reference.brdf(f_spec, t0, t1)
 
 
@@ -58,6 +60,17 @@ class CorrectionResult:
     removed: Array
     flags: Array
     sigma: Array | None = None
+
+
+NUMBERS: Limits = {
+    "scale": (lambda value: 0 < value < np.inf, "a number above 0"),
+    "offset": (np.isfinite, "a number"),
+    "nodata": (lambda value: value is None or isinstance(value, Real), "a number"),
+    "saturation": (lambda value: value is None or not np.isnan(value), "a number"),
+    "image_noise": (lambda value: len(value) == 2 and min(value) >= 0, "a, b, none below 0"),
+    "direction_sigma_deg": (lambda value: 0 <= value <= 45, "an angle from 0 to 45"),
+}
+"""what the numbers that `correct` takes may be"""
 
 
 def correct(
@@ -121,16 +134,12 @@ def correct(
     class_map = np.asarray(classes)
     if cube.ndim != 3 or class_map.shape != cube.shape[1:]:
         raise InputError(f"an image of shape {image.shape} and classes of shape {class_map.shape} do not fit")
-    if not (np.isfinite(scale) and scale > 0):
-        raise InputError(f"scale = {scale}; allowed is a number above 0")
+    numbers = {"scale": scale, "offset": offset, "nodata": nodata, "saturation": saturation}
+    sigmas = {"image_noise": image_noise, "direction_sigma_deg": direction_sigma_deg}
+    check_values(numbers | sigmas, NUMBERS, InputError)
     bands, shape = cube.shape[0], cube.shape[1:]
-    settings = rules or Rules()
-    entries = []
-    for entry in materials.values():
-        surface = material(entry) if isinstance(entry, str) else entry
-        if settings.method == "ratio" and surface.has_peak:
-            check_ratio(surface, wavelength_um, bands)
-        entries.append((surface, surface.at(wavelength_um, bands), settings))
+    settings = Rules() if rules is None else rules
+    entries = [_entry(value, given, settings, wavelength_um, bands) for value, given in materials.items()]
     stored = Stored(
         dtype=cube.dtype,
         scale=(scale,) * bands,
@@ -141,16 +150,17 @@ def correct(
         direction_sigma_deg=direction_sigma_deg,
     )
     rows = {value: row for row, value in enumerate(materials, start=1)}
+    sigma_shape = (1, 1) if np.ndim(np.asarray(normal_sigma_deg)) == 0 else shape
     inputs = BlockInputs(
         image=cube,
         material=class_rows(class_map, rows),
         sun=_vectors("sun", sun, shape),
         view=_vectors("view", view, shape),
         normal=_vectors("normal", [0, 0, 1] if normal is None else normal, shape),
-        shadowed=None if shadowed is None else np.broadcast_to(np.asarray(shadowed, dtype=bool), shape),
-        hidden=None if hidden is None else np.broadcast_to(np.asarray(hidden, dtype=bool), shape),
-        weight=None if weight is None else np.broadcast_to(np.asarray(weight, np.float32), shape),
-        normal_sigma_deg=None if normal_sigma_deg is None else _field(normal_sigma_deg, shape),
+        shadowed=_field("shadowed", shadowed, shape, 1, np.bool_),
+        hidden=_field("hidden", hidden, shape, 1, np.bool_),
+        weight=_field("weight", weight, shape, 1),
+        normal_sigma_deg=_field("normal_sigma_deg", normal_sigma_deg, sigma_shape, 45),
     )
     corrector = Corrector(entries, stored, skip=skip, uncertainty=uncertainty, weighted=weight is not None)
     result = corrector(inputs)
@@ -171,10 +181,33 @@ def _labelled(corrected: Array, removed: Array, flags: Array, sigma: Array | Non
     return CorrectionResult(image.copy(data=corrected), image.copy(data=removed), labelled_flags, labelled_sigma)
 
 
-def _field(values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """A number as (1, 1), or an array of the shape of the pixels."""
-    field = np.asarray(values, np.float32)
-    return field.reshape(1, 1) if field.ndim == 0 else np.broadcast_to(field, shape)
+def _entry(value: Any, given: Any, rules: Rules, wavelength_um: Sequence[float] | None, bands: int) -> Entry:
+    """The material of a class and its parameters in each band."""
+    surface = material(given) if isinstance(given, str) else given
+    if not isinstance(value, Integral) or not isinstance(surface, Material):
+        raise InputError(f"materials holds {value!r}: {given!r}; allowed is an integer: a Material, or its name")
+    if rules.method == "ratio" and surface.has_peak:
+        check_ratio(surface, wavelength_um, bands)
+    return surface, surface.at(wavelength_um, bands), rules
+
+
+def _field(
+    name: str, values: ArrayLike | None, shape: tuple[int, ...], highest: float, kind: DTypeLike = np.float32
+) -> Array | None:
+    """Numbers from 0 on for each pixel, also where one value is given for all; None where none is."""
+    if values is None:
+        return None
+    try:
+        field = np.broadcast_to(np.asarray(values, kind), shape)
+    except (TypeError, ValueError):
+        given = np.asarray(values)
+        raise InputError(
+            f"{name} is {given.dtype} of the shape {given.shape}; allowed are numbers of {shape}"
+        ) from None
+    wrong = ~((field >= 0) & (field <= highest))
+    if wrong.any():
+        raise InputError(f"{name} holds {field[wrong][0]:g}; allowed is 0 to {highest:g}")
+    return field
 
 
 def _vectors(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -9,8 +9,9 @@ TscorrError
 Every message names the thing, its value, what is allowed, and the file.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
+from typing import Any
 
 LONGEST_LINE = 1000
 
@@ -49,6 +50,21 @@ def printable(text: str) -> str:
 
 def _shortened(line: str) -> str:
     return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
+
+
+Limits = Mapping[str, tuple[Callable[[Any], Any], str]]
+"""by name, how to tell that a value is right, and in words what is allowed"""
+
+
+def check_values(values: Mapping[str, Any], limits: Limits, error: type[TscorrError]) -> None:
+    """Raise the error for the first of the values that is not right, or not even of the right type."""
+    for name, (is_right, allowed) in limits.items():
+        try:
+            right = bool(is_right(values[name]))
+        except (TypeError, ValueError, IndexError):
+            right = False
+        if not right:
+            raise error(f"{name} = {values[name]!r}; allowed is {allowed}")
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

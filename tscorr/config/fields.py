@@ -30,6 +30,9 @@ Switch = Annotated[bool, Strict()]
 
 PerBand = Annotated[Number | list[Number], _or_say("a number, or a list of numbers, one a band")]
 
+Share = Annotated[Number, Field(ge=0, le=1)]
+SharePerBand = Annotated[Share | list[Share], _or_say("a share from 0 to 1, or a list of shares, one a band")]
+
 NotNegative = Annotated[Number, Field(ge=0)]
 Noise = tuple[NotNegative, NotNegative]
 NoisePerBand = Annotated[Noise | list[Noise], _or_say("[a, b], or a list of such pairs, one a band, none below 0")]

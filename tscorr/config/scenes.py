@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import AwareDatetime, Field, field_validator, model_validator
 
-from tscorr.config.fields import Number, PerBand, Section, Switch
+from tscorr.config.fields import Number, PerBand, Section, SharePerBand, Switch
 
 
 class Sun(Section):
@@ -169,7 +169,7 @@ class Scene(Section):
     nodata: Number | None = Field(None, description="stored value; default: the file's")
     wavelength_um: list[Number] | None = Field(None, description="centre of each band; default: the file's")
     saturation: PerBand | None = Field(None, description="stored value from which a band is saturated")
-    direct_fraction: PerBand | None = Field(None, description="as in [correction], for this scene")
+    direct_fraction: SharePerBand | None = Field(None, description="as in [correction], for this scene")
     class_map: str = Field(description="raster of classes, on any grid that overlaps the image")
     class_confidence: str | None = Field(None, description="raster of how sure the class is, 0 to 1")
     sun: Sun | None = Field(

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from tscorr.config.fields import NoisePerBand, Number, PerBand, Section, Switch, Whole
+from tscorr.config.fields import NoisePerBand, Number, Section, Share, SharePerBand, Switch, Whole
 from tscorr.config.scenes import SURFACES, VIEWS, Scene, Sun, Truth
 from tscorr.errors import nearest
 
@@ -58,7 +58,7 @@ class Correction(Section):
         "reference: and add what level ground shows at the reference directions",
     )
     reference: Reference = Field(Reference(), description="directions about level ground for method reference")
-    negligible_reflectance: Annotated[Number, Field(ge=0, le=1)] | None = Field(
+    negligible_reflectance: Share | None = Field(
         None,
         description="below this nothing is removed; default: half a stored step (5e-5 for floating point)",
     )
@@ -74,7 +74,7 @@ class Correction(Section):
     irradiance_plane: Literal["horizontal", "facet"] = Field(
         "horizontal", description="the plane that the reflectance of the image refers to"
     )
-    direct_fraction: PerBand = Field(1.0, description="direct share of that irradiance, one value or one a band")
+    direct_fraction: SharePerBand = Field(1.0, description="direct share of that irradiance, one value or one a band")
     sky_specular: Switch = Field(False, description="take the specular part of an even sky's light away too")
     weigh_by_confidence: Switch = Field(
         True, description="take away the part of the lobe that class_confidence says, where it is given"
@@ -82,7 +82,7 @@ class Correction(Section):
     image_noise: NoisePerBand = Field(
         (0.0, 0.0), description="a, b of the image's 1 sigma a + b R in reflectance factor, or one pair a band"
     )
-    direct_fraction_sigma: PerBand = Field(0.0, description="1 sigma of direct_fraction")
+    direct_fraction_sigma: SharePerBand = Field(0.0, description="1 sigma of direct_fraction")
     normal_sigma_deg: Annotated[Number, Field(ge=0, le=45)] | None = Field(
         None,
         description="1 sigma of the surface normals along each of two axes; default: what the surface knows of it",
@@ -105,13 +105,13 @@ class MaterialSettings(Section):
     precision: Literal["fast", "exact", "reference"] | None = None
     method: Method | None = None
     reference: Reference | None = None
-    negligible_reflectance: Annotated[Number, Field(ge=0, le=1)] | None = None
+    negligible_reflectance: Share | None = None
     uncorrectable: Literal["best", "keep", "nodata"] | None = None
     uncorrectable_share: Annotated[Number, Field(gt=0, le=1)] | None = None
     max_zenith_deg: Annotated[Number, Field(gt=0, lt=90)] | None = None
     irradiance_plane: Literal["horizontal", "facet"] | None = None
-    direct_fraction: PerBand | None = None
-    direct_fraction_sigma: PerBand | None = None
+    direct_fraction: SharePerBand | None = None
+    direct_fraction_sigma: SharePerBand | None = None
     sky_specular: Switch | None = None
     normal_sigma_deg: Annotated[Number, Field(ge=0, le=45)] | None = None
     average_normals: Switch | None = None

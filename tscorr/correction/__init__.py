@@ -4,7 +4,7 @@ from tscorr.correction.corrector import BlockInputs, BlockResult, Corrector, cla
 from tscorr.correction.extras import check_ratio, is_extra
 from tscorr.correction.flags import FLAG_VALUES, SINGLE_FLAGS, PixelFlag, SpecularState, specular_state
 from tscorr.correction.rules import NEGLIGIBLE_REFLECTANCE, ReferenceDirections, Rules, Stored
-from tscorr.correction.tables import add_angles, add_tally, new_tally, steepest_deg
+from tscorr.correction.tables import Entry, add_angles, add_tally, new_tally, steepest_deg
 
 __all__ = [
     "FLAG_VALUES",
@@ -13,6 +13,7 @@ __all__ = [
     "BlockInputs",
     "BlockResult",
     "Corrector",
+    "Entry",
     "PixelFlag",
     "ReferenceDirections",
     "Rules",

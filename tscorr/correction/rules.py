@@ -1,10 +1,12 @@
 """How the peak of a material is taken out, and what the stored values of an image mean."""
 
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, fields
+from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tscorr.errors import ConfigError, Limits, check_values, nearest
 
 NEGLIGIBLE_REFLECTANCE = 5e-5
 """threshold for images of floating point, which have no stored step"""
@@ -21,9 +23,34 @@ class ReferenceDirections(NamedTuple):
 REFERENCE = ReferenceDirections()
 
 
+SHARES = "a list of shares from 0 to 1: one, or one a band"
+
+
+def _are_shares(values: Any) -> bool:
+    return len(values) > 0 and all(0 <= value <= 1 for value in values)
+
+
+LIMITS: Limits = {
+    "negligible_reflectance": (lambda value: value >= 0, "a number from 0"),
+    "uncorrectable_share": (lambda value: 0 < value <= 1, "a share above 0, up to 1"),
+    "max_zenith_deg": (lambda value: value is None or 0 < value < 90, "an angle above 0 and below 90"),
+    "direct_fraction": (_are_shares, SHARES),
+    "direct_fraction_sigma": (_are_shares, SHARES),
+    "reference": (
+        lambda value: 0 <= value[0] <= 75 and 0 <= value[1] <= 75 and 0 <= value[2] <= 180,
+        "two zenith angles from 0 to 75 and a relative azimuth from 0 to 180",
+    ),
+    "normal_sigma_deg": (lambda value: value is None or 0 <= value <= 45, "an angle from 0 to 45"),
+}
+"""what the numbers of `Rules` may be"""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rules:
-    """How the peak of one material is taken out; the settings [model] and [correction] of a configuration."""
+    """How the peak of one material is taken out; the settings [model] and [correction] of a configuration.
+
+    Raises ConfigError where a value is none of those allowed.
+    """
 
     form: Literal["full", "simplified"] = "full"
     precision: Literal["fast", "exact", "reference"] = "fast"
@@ -42,6 +69,15 @@ class Rules:
     average_normals: bool = False
     material_covariance: Literal["synthetic", "independent"] = "synthetic"
     enabled: bool = True
+
+    def __post_init__(self) -> None:
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        for field in fields(self):
+            choices = get_args(field.type) if get_origin(field.type) is Literal else ()
+            if choices and values[field.name] not in choices:
+                allowed = f"{', '.join(map(repr, choices))}{nearest(str(values[field.name]), choices)}"
+                raise ConfigError(f"{field.name} = {values[field.name]!r}; allowed are {allowed}")
+        check_values(values, LIMITS, ConfigError)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

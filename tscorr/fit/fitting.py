@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tscorr.errors import ConfigError, InputError
+from tscorr.errors import ConfigError, InputError, Limits, check_values
 from tscorr.fit.advice import advice, check_forward, check_sampling
 from tscorr.fit.measurements import Measurements, Selection
 from tscorr.fit.noise import Noise
@@ -44,10 +44,12 @@ class FitSettings:
     """of the bootstrap"""
 
     def __post_init__(self) -> None:
-        if self.form not in {"full", "simplified"}:
-            raise ConfigError(f"form = {self.form!r}; allowed is 'full' or 'simplified'")
-        if self.k is not None and not 0 <= self.k <= 100:
-            raise ConfigError(f"k = {self.k}; allowed is 0 to 100, or None to fit it")
+        limits: Limits = {
+            "form": ({"full", "simplified"}.__contains__, "'full' or 'simplified'"),
+            "k": (lambda k: k is None or 0 <= k <= 100, "0 to 100, or None to fit it"),
+            "bootstrap": (lambda count: count == int(count) >= 0, "a whole number from 0"),
+        }
+        check_values({name: getattr(self, name) for name in limits}, limits, ConfigError)
         for name in self.shared:
             if name not in SHAREABLE:
                 raise ConfigError(f"shared = {name!r}; allowed are {', '.join(SHAREABLE)}")

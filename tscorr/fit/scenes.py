@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tscorr import reference
-from tscorr.errors import ConfigError, InputError
+from tscorr.errors import ConfigError, InputError, Limits, check_values
 from tscorr.fit.images import ImageSamples
 from tscorr.fit.scene_result import SceneFit
 from tscorr.fit.solver import BOUNDS, INSIDE, SEARCH_N, SEARCH_W, normal_incidence
@@ -57,10 +57,11 @@ class SceneFitSettings:
     """of the choice of samples"""
 
     def __post_init__(self) -> None:
-        if self.form not in {"full", "simplified"}:
-            raise ConfigError(f"form = {self.form!r}; allowed is 'full' or 'simplified'")
-        if not 0 <= self.k <= 100:
-            raise ConfigError(f"k = {self.k}; allowed is 0 to 100")
+        limits: Limits = {
+            "form": ({"full", "simplified"}.__contains__, "'full' or 'simplified'"),
+            "k": (lambda k: 0 <= k <= 100, "0 to 100"),
+        }
+        check_values({name: getattr(self, name) for name in limits}, limits, ConfigError)
 
 
 def fit_samples(samples: ImageSamples, settings: SceneFitSettings | None = None) -> SceneFit:

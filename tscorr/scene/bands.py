@@ -100,11 +100,7 @@ def rules_of(
         **own.model_dump(exclude_none=True),
     }
     fractions = _per_band(values["direct_fraction"], image, "direct_fraction")
-    if any(not 0 <= fraction <= 1 for fraction in fractions):
-        raise ConfigError(f"direct_fraction = {values['direct_fraction']}; allowed are shares from 0 to 1")
     fraction_sigma = _per_band(values["direct_fraction_sigma"], image, "direct_fraction_sigma")
-    if any(not 0 <= sigma <= 1 for sigma in fraction_sigma):
-        raise ConfigError(f"direct_fraction_sigma = {values['direct_fraction_sigma']}; allowed are shares from 0 to 1")
     negligible = values["negligible_reflectance"]
     if negligible is None:
         negligible = stored.step / 2 if stored.step is not None else NEGLIGIBLE_REFLECTANCE

@@ -14,7 +14,7 @@ from tscorr.width.azimuthal import (
     width_across,
     width_table,
 )
-from tscorr.width.lobe import LobeShape, lobe_shape, lobe_shapes, typical_lobe
+from tscorr.width.lobe import LobeShape, is_simplified, lobe_shape, lobe_shapes, typical_lobe
 from tscorr.width.reach import cutoff_tilt, f_spec_bound
 from tscorr.width.summary import Roof, critical_roof, flank_slope, heading_table, width_rows
 from tscorr.width.zenithal import crossover_incidence, peak_exitance, zenithal_width
@@ -31,6 +31,7 @@ __all__ = [
     "f_spec_bound",
     "flank_slope",
     "heading_table",
+    "is_simplified",
     "lobe_shape",
     "lobe_shapes",
     "peak_exitance",

@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tscorr import reference
-from tscorr.materials import Material
-from tscorr.width.lobe import LN2, Array, LobeShape, bisect, is_simplified, lobe_shape
+from tscorr.width.lobe import LN2, Array, Lobe, LobeShape, bisect, is_simplified, lobe_shape
 
 
 def azimuthal_width(
-    m: Material | LobeShape,
+    m: Lobe,
     incidence_deg: ArrayLike,
     exitance_deg: ArrayLike | None = None,
     form: str = "full",
@@ -31,6 +30,7 @@ def azimuthal_width(
 ) -> Array:
     """Full width at half maximum of the peak in degrees of azimuth, in (0, 360].
 
+    m      : a material, or the name of one of the built-in library.
     incidence_deg, exitance_deg : from the facet normal; shapes broadcast; exitance = incidence by default.
     form   : "full", or "simplified" without the geometric attenuation factor.
     lobe   : True for f_spec as a whole; False for its exponential alone, in closed form.
@@ -39,7 +39,7 @@ def azimuthal_width(
     with a normal reflectance above 1/3 might cross the half more than once; then one crossing is found.
     Error: relative 1e-14 (1 + (w D)^2), D half the difference of the angles; more where a width nears 360.
 
-    >>> azimuthal_width(material("roof_tile"), [30, 50, 65]).round(1)
+    >>> azimuthal_width("roof_tile", [30, 50, 65]).round(1)
     array([185.6,  78.7,  42.3])
     """
     shape, simplified = lobe_shape(m, wavelength_um), is_simplified(form)
@@ -52,7 +52,7 @@ def azimuthal_width(
 
 
 def azimuthal_arc(
-    m: Material | LobeShape,
+    m: Lobe,
     incidence_deg: ArrayLike,
     exitance_deg: ArrayLike | None = None,
     form: str = "full",
@@ -66,7 +66,7 @@ def azimuthal_arc(
     return width * np.sin(np.deg2rad(exitance))
 
 
-def width_across(m: Material | LobeShape, incidence_deg: ArrayLike, *, wavelength_um: float | None = None) -> Array:
+def width_across(m: Lobe, incidence_deg: ArrayLike, *, wavelength_um: float | None = None) -> Array:
     """Full width at half maximum of the exponential across the principal plane. [deg]
 
     Along the great circle through the mirror direction, at a right angle to the plane: with half of it
@@ -84,7 +84,7 @@ def width_across(m: Material | LobeShape, incidence_deg: ArrayLike, *, wavelengt
 
 
 def why_no_width(
-    m: Material | LobeShape,
+    m: Lobe,
     incidence_deg: float,
     exitance_deg: float | None = None,
     form: str = "full",
@@ -110,7 +110,7 @@ def why_no_width(
     return f"too broad: at relative azimuth 0 still {left:.0f} % of the value at 180, so never below half"
 
 
-def smallest_incidence(m: Material | LobeShape, form: str = "full", *, wavelength_um: float | None = None) -> float:
+def smallest_incidence(m: Lobe, form: str = "full", *, wavelength_um: float | None = None) -> float:
     """Incidence, = exitance, from which on the whole lobe has an azimuthal width; 360 degrees there. [deg]
 
     nan where it never has: no specular part, or as broad as the hemisphere.
@@ -138,7 +138,7 @@ class WidthTable:
     MAX_ERROR_DEG = 1e-3
     INTERVALS = 1024
 
-    def __init__(self, m: Material | LobeShape, form: str = "full", *, wavelength_um: float | None = None) -> None:
+    def __init__(self, m: Lobe, form: str = "full", *, wavelength_um: float | None = None) -> None:
         shape = lobe_shape(m, wavelength_um)
         self.edge_deg = smallest_incidence(shape, form)
         """incidence below which there is no width; nan where there is none at all"""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tscorr import reference
 from tscorr.errors import ConfigError
-from tscorr.materials import BandParameters, Material
+from tscorr.materials import BandParameters, Material, material
 
 Array = NDArray[np.float64]
 
@@ -47,13 +47,20 @@ class LobeShape:
         return reference.fresnel(cos_l, np.asarray(self.n), np.asarray(self.k))
 
 
-def lobe_shape(m: Material | LobeShape, wavelength_um: float | None = None) -> LobeShape:
+Lobe = Material | LobeShape | str
+"""whose width is asked for: a material, the name of a built-in one, or a lobe by itself"""
+
+
+def lobe_shape(m: Lobe, wavelength_um: float | None = None) -> LobeShape:
     """The lobe of a material at a wavelength [um], by default the middle one of its own.
 
-    A LobeShape is handed through. Raises MaterialError where the material does not cover the wavelength.
+    A LobeShape is handed through. Raises MaterialError where no built-in material has the name, or where the
+    material does not cover the wavelength.
     """
     if isinstance(m, LobeShape):
         return m
+    if isinstance(m, str):
+        m = material(m)
     own = m.wavelength_um
     if wavelength_um is None and own:
         wavelength_um = own[len(own) // 2]

@@ -4,8 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tscorr import reference
-from tscorr.materials import Material
-from tscorr.width.lobe import Array, LobeShape, is_simplified, lobe_shape
+from tscorr.width.lobe import Array, Lobe, is_simplified, lobe_shape
 
 Range = tuple[ArrayLike, ArrayLike]
 
@@ -14,7 +13,7 @@ ROUNDING = 64 * np.finfo(float).eps
 
 
 def cutoff_tilt(
-    m: Material | LobeShape,
+    m: Lobe,
     incidence_deg: ArrayLike,
     exitance_deg: ArrayLike,
     negligible_reflectance: float,

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from tscorr import reference
 from tscorr.angles import relative_azimuth, unit_vector, zenith_azimuth
 from tscorr.errors import InputError
-from tscorr.materials import BandParameters, Material
+from tscorr.materials import BandParameters
 from tscorr.width.azimuthal import azimuthal_arc, azimuthal_width
-from tscorr.width.lobe import Array, LobeShape, is_simplified, lobe_shape
+from tscorr.width.lobe import Array, Lobe, LobeShape, is_simplified, lobe_shape
 from tscorr.width.zenithal import peak_exitance, zenithal_width
 
 ROW_INCIDENCES_DEG = tuple(range(10, 75, 5))
@@ -22,7 +22,7 @@ SCAN_STEP_DEG = 0.25
 
 
 def width_rows(
-    m: Material | LobeShape,
+    m: Lobe,
     incidences_deg: Sequence[float] = ROW_INCIDENCES_DEG,
     form: str = "full",
     *,
@@ -50,7 +50,7 @@ def _rows(shape: LobeShape, incidences_deg: tuple[float, ...], form: str) -> lis
     return [{key: _or_none(values[row]) for key, values in columns.items()} for row in range(len(incidence))]
 
 
-def flank_slope(m: Material | LobeShape, *, wavelength_um: float | None = None) -> float:
+def flank_slope(m: Lobe, *, wavelength_um: float | None = None) -> float:
     """How fast the exponential falls where it is half of its peak: relative change per degree of facet tilt.
 
     |d ln exp(-(w alpha)^2) / d alpha| = 2 w^2 alpha at alpha = sqrt(ln 2) / w. A surface normal that errs by a

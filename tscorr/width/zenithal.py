@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tscorr import reference
-from tscorr.materials import Material
 from tscorr.width.azimuthal import azimuthal_width
-from tscorr.width.lobe import LN2, Array, LobeShape, bisect, highest, is_simplified, lobe_shape
+from tscorr.width.lobe import LN2, Array, Lobe, LobeShape, bisect, highest, is_simplified, lobe_shape
 
 HORIZON_DEG = 89.999
 """A lobe that still rises here rises to the horizon: the simplified form is infinite at 90."""
@@ -22,7 +21,7 @@ STEPS = 360
 
 
 def peak_exitance(
-    m: Material | LobeShape,
+    m: Lobe,
     incidence_deg: ArrayLike,
     form: str = "full",
     *,
@@ -43,7 +42,7 @@ def peak_exitance(
 
 
 def zenithal_width(
-    m: Material | LobeShape,
+    m: Lobe,
     incidence_deg: ArrayLike,
     form: str = "full",
     lobe: bool = False,
@@ -71,7 +70,7 @@ def zenithal_width(
 
 
 def crossover_incidence(
-    m: Material | LobeShape, form: str = "full", lobe: bool = False, *, wavelength_um: float | None = None
+    m: Lobe, form: str = "full", lobe: bool = False, *, wavelength_um: float | None = None
 ) -> float:
     """Incidence above which the azimuthal width [deg of azimuth] is smaller than the zenithal one. [deg]
 
