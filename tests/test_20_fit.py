@@ -366,6 +366,21 @@ def test_lambertian_surface_is_said_to_have_no_peak():
     assert result.parameters[0, 0] == pytest.approx(0.1, rel=0.05)
 
 
+@pytest.mark.parametrize(
+    ("f_r", "message"),
+    [
+        (np.full(122, 0.1), "f_r is 0.1 in every direction"),
+        (np.full(122, 0.0), "f_r is nowhere above 0"),
+        (np.full(122, -0.1), "f_r is nowhere above 0"),
+        (np.abs(np.random.default_rng(0).normal(0.1, 0.05, 122)), "no peak stands out of the scatter"),
+    ],
+    ids=["constant", "zero", "negative", "noise"],
+)
+def test_measurements_without_a_peak_are_refused_for_what_they_are(f_r, message):
+    with pytest.raises(InputError, match=message):
+        fit_brdf(*paper_grid(), f_r)
+
+
 def test_lobe_between_the_samples_is_refused():
     angles = paper_grid()
     f_r = brdf((0.05, 300.0, 2.0, 1.5, 0.25), angles)

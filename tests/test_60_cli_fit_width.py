@@ -50,6 +50,22 @@ def measured(tmp_path):
     return path
 
 
+def test_fit_does_not_write_what_did_not_converge(measured, tmp_path, monkeypatch):
+    monkeypatch.setattr("tscorr.fit.solver.MAX_EVALUATIONS", 2)
+    result = run("fit", measured, "-o", tmp_path / "m.toml")
+    assert result.exit_code == 2
+    assert "! the fit did not converge: do not use it" in result.stdout
+    assert result.stderr == "tscorr: fits that did not converge, and of which no material is written: concrete\n"
+    assert not (tmp_path / "m.toml").exists()
+
+
+def test_fit_says_how_many_samples_it_used(measured):
+    forward = len(measured.read_text().splitlines()) - 1
+    with measured.open("a", encoding="utf-8") as file:
+        file.write("\n30,40,10,0.1,0.01,0.1,0.01" * 5)
+    assert f"  {forward} of {forward + 5} samples, 2 wavelength(s)" in run("fit", measured).stdout
+
+
 def test_fit_writes_a_material_file(measured, tmp_path):
     result = run("fit", measured, "-o", tmp_path / "m.toml", "--name", "my_concrete", "--plot", tmp_path / "plots")
     assert result.exit_code == 0

@@ -17,7 +17,7 @@ from tscorr.cli.common import (
     with_clear_errors,
 )
 from tscorr.cli.scenes import progress_bars
-from tscorr.errors import ConfigError
+from tscorr.errors import ConfigError, InputError
 
 
 @click.command()
@@ -78,18 +78,23 @@ def fit(
         settings = FitSettings(k=held, form=form, bootstrap=bootstrap)
         only = None if wavelengths is None else [number("--wavelengths", um, "um,um") for um in wavelengths.split(",")]
         fitted = fit_files(files, output, name=name, wavelengths_um=only, settings=settings, plot_directory=plot)
-        click.echo(fitted.text)
+        text, unfinished = fitted.text, fitted.unfinished
     else:
         given = {"--name": name, "--wavelengths": wavelengths, "--bootstrap": bootstrap, "--plot": plot}
         for option in (option for option, value in given.items() if value):
             raise ConfigError(f"{option} is for files of measurements; leave it out with --scenes")
-        click.echo(_fit_to_scenes(config, output, held, form))
-    if output is not None:
+        text, unfinished = _fit_to_scenes(config, output, held, form)
+    click.echo(text)
+    if output is not None and output.exists():
         click.echo(f"materials: {output}")
+    if unfinished:
+        raise InputError(f"fits that did not converge, and of which no material is written: {', '.join(unfinished)}")
 
 
-def _fit_to_scenes(config: Path, output: Path | None, k: float | None, form: Literal["full", "simplified"]) -> str:
-    """Fit the materials of a configuration to its scenes; the result as text."""
+def _fit_to_scenes(
+    config: Path, output: Path | None, k: float | None, form: Literal["full", "simplified"]
+) -> tuple[str, tuple[str, ...]]:
+    """Fit the materials of a configuration to its scenes; the result as text, and what did not converge."""
     from tscorr import batch
     from tscorr.config import load_config
     from tscorr.fit.scenes import SceneFitSettings
@@ -98,7 +103,8 @@ def _fit_to_scenes(config: Path, output: Path | None, k: float | None, form: Lit
     if k is None:
         raise ConfigError("--k free is for files of measurements: images do not tell n, t1 and k apart")
     with progress_bars(enabled=sys.stderr.isatty()) as progress:
-        return fit_scenes(batch.plan(load_config(config)), output, SceneFitSettings(k=k, form=form), progress).text
+        fitted = fit_scenes(batch.plan(load_config(config)), output, SceneFitSettings(k=k, form=form), progress)
+    return fitted.text, fitted.unfinished
 
 
 @click.command()

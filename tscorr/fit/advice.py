@@ -14,6 +14,8 @@ from tscorr.fit.solver import BOUNDS, Problem, Solution, lobe_grid
 
 Array = NDArray[np.float64]
 
+ROUNDING = 1e-9  # relative, of measurements that are all the same
+FLAT = 10.0  # F value of a lobe against a constant, below which it may be scatter
 REVERSED = 0.5  # chi2 of the reversed phi over that of the given phi, below which phi is reversed
 IN_LOBE = 2.0  # of w alpha: exp(-4) = 2 % of the peak
 FEWEST_IN_LOBE = 8  # twice the parameters
@@ -30,6 +32,21 @@ FEWEST_DIFFUSE = 10  # samples for a trend
 STEEP_DEG = 65.0  # the rise of F beyond it separates n from t1
 ALIKE = 9.0  # difference of chi2, in units of chi2/df, within which two minima are equally good
 COMMON = 0.3  # correlation of residuals between wavelengths
+
+
+def check_varies(used: Measurements) -> None:
+    """Refuse measurements that are of nothing, or the same in every direction."""
+    highest, lowest = np.nanmax(used.f_r, axis=1), np.nanmin(used.f_r, axis=1)
+    dark = np.flatnonzero(highest <= 0)
+    if dark.size:
+        raise InputError(
+            f"{used.source}: {_at(used, dark)}f_r is nowhere above 0; allowed are numbers in 1/sr above 0"
+        )
+    if np.all(highest - lowest <= ROUNDING * highest):
+        raise InputError(
+            f"{used.source}: f_r is {highest[0]:.4g} in every direction, so that there is no peak to fit; a material "
+            f"with this as its t0, and t1 = 0, says so"
+        )
 
 
 def check_forward(measured: Measurements, problem: Problem) -> None:
@@ -59,6 +76,12 @@ def check_sampling(result: FitResult, left_out_mirror: Measurements) -> None:
     ratio = _mirror_ratio(result, left_out_mirror)
     if inside >= FEWEST_IN_LOBE and ratio <= MIRROR_REFUSED:
         return
+    if _lobe_against_constant(result) < FLAT:
+        raise InputError(
+            f"{result.measured.source}: no peak stands out of the scatter of f_r: no direction near phi = 180, "
+            f"theta_r = theta_i is brighter than others by more. Measure there in finer steps, or more exactly; a "
+            f"surface without a peak is a material of t1 = 0"
+        )
     finding = (
         f"{inside} samples lie within {within:.2g} degrees of facet tilt, where the fitted lobe is"
         if inside < FEWEST_IN_LOBE
@@ -88,7 +111,7 @@ def _of_the_lobe(result: FitResult, left_out_mirror: Measurements) -> Iterator[s
     weak = np.flatnonzero(result.t1_f0 < SIGNIFICANT * result.t1_f0_sigma)
     if weak.size:
         yield (
-            f"{_where(result, weak)}no peak stands out (t1 F0 = {result.t1_f0[weak[0]]:.2g} +- "
+            f"{_at(result.measured, weak)}no peak stands out (t1 F0 = {result.t1_f0[weak[0]]:.2g} +- "
             f"{result.t1_f0_sigma[weak[0]]:.2g}): set t1 = 0, the surface is diffuse"
         )
     inside, within = _in_lobe(result)
@@ -127,7 +150,7 @@ def _of_the_parameters(result: FitResult, solution: Solution) -> Iterator[str]:
         stuck = np.flatnonzero((column < low * 1.01) | (column > high * 0.99))
         if stuck.size:
             yield (
-                f"{_where(result, stuck)}{name} = {column[stuck[0]]:.3g} is at the end of its range, {low:g} "
+                f"{_at(result.measured, stuck)}{name} = {column[stuck[0]]:.3g} is at the end of its range, {low:g} "
                 f"to {high:g}: the data do not determine it; share it, or widen the range of zenith angles"
             )
     best = float(solution.chi2.sum())
@@ -150,7 +173,7 @@ def _of_the_residuals(result: FitResult, noise: Noise) -> Iterator[str]:
     if bent.size:
         typical = float(np.median(change[bent]))
         yield (
-            f"{_where(result, bent)}the diffuse part is not Lambertian: it changes by {typical:+.0%} of t0 "
+            f"{_at(result.measured, bent)}the diffuse part is not Lambertian: it changes by {typical:+.0%} of t0 "
             f"from low to high zenith angles; fit a smaller range of zenith angles (max_zenith_deg), and use "
             f"the material for that range only"
         )
@@ -167,6 +190,18 @@ def _in_lobe(result: FitResult) -> tuple[int, float]:
     """How many samples lie in the lobe, and the facet tilt [deg] that bounds it."""
     within = IN_LOBE / float(np.median(result.parameters[:, 2]))
     return int(np.sum(result.measured.facet_tilt_deg < within)), within
+
+
+def _lobe_against_constant(result: FitResult) -> float:
+    """F value: what the lobes take off chi2 for each of their parameters, against what is left a degree of freedom."""
+    f_r, weight = result.measured.f_r, result.sigma**-2
+    weight = np.where(np.isfinite(f_r), weight, 0)
+    values = np.where(np.isfinite(f_r), f_r, 0)
+    mean = (weight * values).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
+    constant = float((weight * (values - mean) ** 2).sum())
+    left = result.chi2_dof * result.degrees_of_freedom
+    parameters = weight[weight > 0].size - len(f_r) - result.degrees_of_freedom
+    return (constant - left) / parameters / max(result.chi2_dof, np.finfo(float).tiny)
 
 
 def _mirror_ratio(result: FitResult, left_out_mirror: Measurements) -> float:
@@ -199,9 +234,9 @@ def _diffuse_trend(result: FitResult) -> tuple[Array, Array]:
     return change, significance
 
 
-def _where(result: FitResult, bands: NDArray[np.intp]) -> str:
+def _at(measured: Measurements, bands: NDArray[np.intp]) -> str:
     """`at 0.55 um: ` or `at 3 of 31 wavelengths: `, nothing where there is one."""
-    wavelengths = result.measured.wavelength_um
+    wavelengths = measured.wavelength_um
     if len(wavelengths) < 2 or len(bands) == len(wavelengths):
         return ""
     if len(bands) == 1:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from tscorr.errors import InputError
 from tscorr.fit.fitting import FitSettings, fit_measurements
-from tscorr.fit.library import save_materials
+from tscorr.fit.library import save_converged
 from tscorr.fit.measurements import Measurements, merge
 from tscorr.fit.readers import read_measurements
 from tscorr.fit.result import FitResult
@@ -17,6 +17,8 @@ class FittedFiles(NamedTuple):
 
     results: dict[str, FitResult]
     text: str
+    unfinished: tuple[str, ...]
+    """materials whose fits did not converge, which are not written"""
 
 
 def fit_files(
@@ -36,7 +38,8 @@ def fit_files(
     wavelengths_um : only these; each must have been measured
     plot_directory : where to draw curves and residuals
 
-    Raises InputError naming the file where one cannot be read or fitted; then nothing is written.
+    A material whose fit did not converge is not written. Raises InputError naming the file where one cannot be read
+    or fitted; then nothing is written.
     """
     if output is not None and Path(output).resolve() in {Path(path).resolve() for path in paths}:
         raise InputError(f"the material file {output} is one of the files of measurements; allowed is another name")
@@ -45,14 +48,13 @@ def fit_files(
         key: fit_measurements(measured if wavelengths_um is None else measured.at(wavelengths_um), settings, key)
         for key, measured in _by_material(paths, name).items()
     }
-    if output is not None:
-        save_materials([result.material for result in results.values()], output)
+    unfinished = save_converged(results, output)
     if plot_directory is not None:
         from tscorr.fit.plots import save_plots
 
         for result in results.values():
             save_plots(result, plot_directory)
-    return FittedFiles(results, "\n\n".join(result.summary() for result in results.values()))
+    return FittedFiles(results, "\n\n".join(result.summary() for result in results.values()), unfinished)
 
 
 def _by_material(paths: Sequence[str | Path], name: str | None) -> dict[str, Measurements]:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tscorr.errors import ConfigError, InputError, Limits, check_values
-from tscorr.fit.advice import advice, check_forward, check_sampling
+from tscorr.fit.advice import advice, check_forward, check_sampling, check_varies
 from tscorr.fit.measurements import Measurements, Selection
 from tscorr.fit.noise import Noise
 from tscorr.fit.result import Bootstrap, FitResult, common_residual, to_physical
@@ -104,6 +104,7 @@ def fit_brdf(
 def fit_measurements(measured: Measurements, settings: FitSettings, name: str) -> FitResult:
     """`fit_brdf` of checked measurements; `name` becomes the material's."""
     used = _selected(measured, settings.selection)
+    check_varies(used)
     noise = Noise.of(used)
     problem = Problem(
         geometry=used.geometry,
@@ -115,7 +116,7 @@ def fit_measurements(measured: Measurements, settings: FitSettings, name: str) -
     )
     check_forward(measured, problem)
     problem, solution = _reweighted(problem, solve(problem), noise)
-    result = _result(used, problem, solution, noise, settings, name)
+    result = _result(used, problem, solution, noise, settings, name, len(measured.zenith_deg))
     left_out = settings.selection.left_out_mirror(measured)
     check_sampling(result, left_out)
     if settings.bootstrap:
@@ -175,6 +176,7 @@ def _result(
     noise: Noise,
     settings: FitSettings,
     name: str,
+    given: int,
 ) -> FitResult:
     parameters, formal = to_physical(problem, solution)
     covariances, scale = _scaled(formal, problem, solution, noise)
@@ -188,6 +190,7 @@ def _result(
         degrees_of_freedom=degrees_of_freedom,
         t1_f0=solution.parameters[:, 1],
         t1_f0_sigma=np.sqrt(scale * solution.covariance[:, 1, 1]),
+        given=given,
         measured=used,
         model_f_r=solution.f_r,
         sigma=problem.sigma,

@@ -2,9 +2,9 @@
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import tomli_w
 
@@ -29,6 +29,26 @@ def save_materials(materials: Iterable[Material], path: str | Path) -> None:
     except OSError as error:
         hidden.unlink(missing_ok=True)
         raise OutputError(f"the materials {path} cannot be written: {error}") from None
+
+
+class Fitted(Protocol):
+    """A fit of a material, whatever it was fitted to."""
+
+    @property
+    def material(self) -> Material:
+        """What was found."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether it may be used."""
+
+
+def save_converged(results: Mapping[str, Fitted], path: str | Path | None) -> tuple[str, ...]:
+    """Write the materials whose fits converged, if there is a path to write to; the names of the others."""
+    usable = [result.material for result in results.values() if result.converged]
+    if path is not None and usable:
+        save_materials(usable, path)
+    return tuple(name for name, result in results.items() if not result.converged)
 
 
 def _table(material: Material) -> dict[str, Any]:

@@ -44,6 +44,8 @@ class FitResult:
     t1_f0: Array
     """(bands,) t1 F0, the strength of the lobe at normal incidence: well determined where t1 is not"""
     t1_f0_sigma: Array
+    given: int
+    """how many samples there are, used or not"""
     measured: Measurements
     """the samples used"""
     model_f_r: Array

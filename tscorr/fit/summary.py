@@ -11,7 +11,7 @@ def summary(result: FitResult) -> str:
     held = "k" not in result.names
     bands, samples = result.measured.f_r.shape
     fit = (
-        f"  {samples} samples, {bands} wavelength(s), chi2/df = {result.chi2_dof:.3g} with "
+        f"  {samples} of {result.given} samples, {bands} wavelength(s), chi2/df = {result.chi2_dof:.3g} with "
         f"df = {result.degrees_of_freedom}; 1 sigma is {_scaling(result):.3g} times the formal one"
     )
     lines = [f"{material.name}: {material.source}", fit]

@@ -19,7 +19,7 @@ from tscorr.angles import facet_angles
 from tscorr.correction import BlockInputs, class_rows
 from tscorr.errors import InputError
 from tscorr.fit.images import ImageSamples, merged
-from tscorr.fit.library import save_materials
+from tscorr.fit.library import save_converged
 from tscorr.fit.scene_result import SceneFit
 from tscorr.fit.scenes import MIN_SAMPLES, SceneFitSettings, fit_samples
 from tscorr.grid import Block
@@ -45,6 +45,8 @@ class FittedScenes(NamedTuple):
 
     results: dict[str, SceneFit]
     text: str
+    unfinished: tuple[str, ...]
+    """materials whose fits did not converge, which are not written"""
 
 
 def fit_scenes(
@@ -60,8 +62,8 @@ def fit_scenes(
     settings : of the fit.
     progress : given a scene that starts, a function that is told of pixels done.
     Materials that the libraries know without a peak, or that are not enabled, are left alone; so are those with
-    fewer than 100 samples, which the text says. Raises InputError where the scenes differ in their bands, or where
-    no material can be fitted; then nothing is written.
+    fewer than 100 samples, which the text says. Those whose fits do not converge are not written. Raises InputError
+    where the scenes differ in their bands, or where no material can be fitted; then nothing is written.
     """
     settings = settings or SceneFitSettings()
     gathered = gather(scenes, seed=settings.seed, progress=progress)
@@ -73,9 +75,9 @@ def fit_scenes(
         raise InputError(
             "no material can be fitted: " + ("; ".join(left_out) or "no material of [materials.classes] has a peak")
         )
-    if output is not None:
-        save_materials([result.material for result in results.values()], output)
-    return FittedScenes(results, "\n\n".join([*(result.summary() for result in results.values()), *left_out]))
+    unfinished = save_converged(results, output)
+    text = "\n\n".join([*(result.summary() for result in results.values()), *left_out])
+    return FittedScenes(results, text, unfinished)
 
 
 def gather(
