@@ -22,6 +22,7 @@ from small_scene import (
     SCENE,
     SHAPE,
     TILE,
+    UNKNOWN,
     WEST,
     class_map,
     heights,
@@ -589,6 +590,19 @@ def test_the_version_is_that_of_the_package_and_is_stamped_into_the_outputs(tmp_
         assert file.tags()["TSCORR_VERSION"] == __version__
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32])
+def test_plan_names_the_classes_without_material(tmp_path, dtype):
+    config = small_scene(tmp_path)
+    values = class_map().astype(dtype)
+    values[40:, :8] = 77
+    write_raster(tmp_path / "class_map.tif", values)
+    shares = {str(value): np.mean(values == value) for value in (77, UNKNOWN)}
+    (planned,) = json.loads(tscorr("plan", config, "--json").stdout)["scenes"]
+    assert planned["classes_without_material"] == pytest.approx(shares)
+    listed = f"class 77: {100 * shares['77']:.1f} %, class {UNKNOWN}: {100 * shares[str(UNKNOWN)]:.1f} %"
+    assert f"of the pixels ({listed})\n" in tscorr("plan", config).stdout
+
+
 def test_plan_and_report_agree_on_the_views():
     planned = json.loads(tscorr("plan", Path(__file__).parent.parent / "configs" / "delft.toml", "--json").stdout)[
         "scenes"
@@ -601,6 +615,11 @@ def test_plan_and_report_agree_on_the_views():
     [
         ({"7": "roof_tile"}, {}, "roofs: nothing was assessed: no class of [materials.classes] occurs where"),
         ({str(TILE): "roof_tile"}, {"saturation": 0.9}, "roofs: every pixel is saturated: is `saturation` in stored"),
+        (
+            {str(TILE): "roof_tile"},
+            {"view": {"kind": "constant", "zenith_deg": 88.0, "azimuth_deg": 0.0}, "surface": {"kind": "flat"}},
+            "roofs: no pixel of roof_tile was assessed; of the scene's 3,072 pixels 336 are GRAZING",
+        ),
     ],
 )
 def test_what_can_hardly_be_meant_is_said(tmp_path, classes, keys, said):

@@ -93,7 +93,7 @@ def print_outcome(result: "BatchResult") -> None:
                 f"(RMS of reflectance against the truth)"
                 + (f": {residual['ratio']:.3f} of it is left" if residual["ratio"] is not None else "")
             )
-        notes += [f"{scene.name}: {doubt}" for doubt in doubts(report["pixels"])]
+        notes += [f"{scene.name}: {doubt}" for doubt in doubts(report)]
         if bad := report.get("bad_bands"):
             notes.append(f"{scene.name}: {left_alone(bad)}")
         if scene.state == "current":
@@ -106,9 +106,19 @@ def print_outcome(result: "BatchResult") -> None:
     click.echo(f"results: {folder}")
 
 
-def doubts(pixels: dict[str, int]) -> list[str]:
+WHY_NOT = ("nodata", "self_shadow", "cast_shadow", "not_viewed", "grazing")
+"""flags that keep the pixels of a material from being assessed"""
+
+
+def doubts(report: dict[str, Any]) -> list[str]:
     """What can hardly be meant, from the pixel counts of a report."""
-    found = []
+    found, pixels = [], report["pixels"]
+    unseen = [name for name, entry in report["materials"].items() if 0 < entry["pixels"] == entry["not_assessed"]]
+    if unseen:
+        flags = ", ".join(f"{pixels[key]:,} are {key.upper()}" for key in WHY_NOT if pixels[key])
+        found.append(
+            f"no pixel of {', '.join(unseen)} was assessed; of the scene's {pixels['total']:,} pixels {flags}"
+        )
     if 0 < pixels["valid"] == pixels["no_material"]:
         found.append("nothing was assessed: no class of [materials.classes] occurs where the image has data")
     if 0 < pixels["valid"] == pixels["saturated"]:
@@ -147,7 +157,7 @@ def plan(config: Path, as_json: bool) -> None:
             click.echo(f"  {name}: {100 * share:.1f} % of the pixels")
         if entry["bad_bands"]:
             click.echo(f"  {left_alone(entry['bad_bands'])}")
-        click.echo(f"  no material: {100 * entry['no_material']:.1f} % of the pixels")
+        click.echo(f"  no material: {100 * entry['no_material']:.1f} % of the pixels{_listed(entry)}")
         skipped = f"{entry['blocks_no_specular_material']} of {entry['blocks']} blocks have nothing to correct"
         click.echo(
             f"  {skipped}; at most {entry['disk_mb']:.0f} MB on disk, about {entry['memory_mb']:.0f} MB of memory"
@@ -159,6 +169,17 @@ def plan(config: Path, as_json: bool) -> None:
                 f"of the blocks"
             )
         click.echo(f"  {'current: nothing to do' if entry['current'] else 'to be computed'}")
+
+
+MOST_CLASSES = 6
+
+
+def _listed(entry: dict[str, Any]) -> str:
+    """The most frequent classes that have no material, as the end of a line."""
+    shares = list(entry["classes_without_material"].items())
+    listed = [f"class {value}: {100 * share:.1f} %" for value, share in shares[:MOST_CLASSES]]
+    more = [f"{len(shares) - MOST_CLASSES} more"] if len(shares) > MOST_CLASSES else []
+    return f" ({', '.join(listed + more)})" if listed else ""
 
 
 @click.command()

@@ -1,9 +1,11 @@
 """What a scene would cost and skip: the content of `tscorr plan`."""
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tscorr.correction import Corrector, class_rows
 from tscorr.scene.correct import is_current, view_samples
@@ -14,6 +16,8 @@ from tscorr.scene.thresholds import by_threshold
 
 if TYPE_CHECKING:
     from tscorr.grid import Block
+
+Array = NDArray[Any]
 
 PRODUCT_BYTES = {"flags": 2, "azimuthal_width": 4, "angles": 36}
 OVERVIEWS = 4 / 3
@@ -30,9 +34,13 @@ def forecast(scene: Scene) -> dict[str, Any]:
     counts = np.zeros(len(scene.materials) + 1, np.int64)
     cut = units_of(scene)
     present: dict[Block, list[int]] = {}
+    unknown: Counter[int] = Counter()
     with scene.classes() as classes:
         for block in cut:
-            in_block = np.bincount(class_rows(classes.read(block, 1), scene.rows).ravel(), minlength=len(counts))
+            values = classes.read(block, 1)
+            material = class_rows(values, scene.rows)
+            in_block = np.bincount(material.ravel(), minlength=len(counts))
+            unknown.update(_counted(values[material == 0]))
             counts += in_block
             present[block] = [int(row) for row in np.flatnonzero(in_block * peaks)]
     rows, cols = scene.image.shape
@@ -52,6 +60,7 @@ def forecast(scene: Scene) -> dict[str, Any]:
             surface.name: float(counts[row] / total) for row, (surface, _, _) in enumerate(scene.materials, start=1)
         },
         "no_material": float(counts[0] / total),
+        "classes_without_material": {str(value): count / total for value, count in unknown.most_common()},
         "blocks": len(cut),
         "blocks_no_specular_material": sum(not rows for rows in present.values()),
         "negligible": by_threshold(scene, present),
@@ -59,6 +68,14 @@ def forecast(scene: Scene) -> dict[str, Any]:
         "memory_mb": memory_mb(scene),
         "current": is_current(scene),
     }
+
+
+def _counted(values: Array) -> dict[int, int]:
+    """How often each value occurs."""
+    if values.dtype == np.uint8:
+        counts = np.bincount(values)
+        return {int(value): int(counts[value]) for value in np.flatnonzero(counts)}
+    return dict(zip(*(found.tolist() for found in np.unique(values, return_counts=True)), strict=True))
 
 
 def disk_bytes(scene: Scene) -> tuple[float, float]:
