@@ -590,6 +590,17 @@ def test_the_version_is_that_of_the_package_and_is_stamped_into_the_outputs(tmp_
         assert file.tags()["TSCORR_VERSION"] == __version__
 
 
+def test_all_missing_files_of_a_scene_are_told_at_once(tmp_path):
+    config = small_scene(
+        tmp_path, {"class_confidence": "sure.tif", "view": {"kind": "line", "trajectory": "line.csv"}}
+    )
+    for name in ("image.tif", "class_map.tif", "dsm.tif"):
+        (tmp_path / name).unlink()
+    missing = ("image.tif", "class_map.tif", "sure.tif", "line.csv", "dsm.tif")
+    lines = [f"tscorr: scene 'roofs': {tmp_path / name} does not exist" for name in missing]
+    assert tscorr("plan", config).stderr.splitlines() == lines
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32])
 def test_plan_names_the_classes_without_material(tmp_path, dtype):
     config = small_scene(tmp_path)

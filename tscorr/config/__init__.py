@@ -1,6 +1,6 @@
 """The configuration: a TOML file as pydantic models, checked before any work starts."""
 
-from tscorr.config.loading import absolute, load_config
+from tscorr.config.loading import absolute, load_config, paths_of
 from tscorr.config.scenes import (
     AnglesViewSettings,
     ConstantViewSettings,
@@ -41,5 +41,6 @@ __all__ = [
     "absolute",
     "json_schema",
     "load_config",
+    "paths_of",
     "template",
 ]

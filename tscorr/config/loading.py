@@ -113,6 +113,19 @@ PATHS = {
 }
 
 
+def paths_of(scene: Scene) -> list[Path]:
+    """The files that a scene names, beside its image."""
+    return list(_named_paths(scene.model_dump()))
+
+
+def _named_paths(value: Any, key: str = "") -> Iterator[Path]:
+    if isinstance(value, dict):
+        for name, item in value.items():
+            yield from _named_paths(item, name)
+    elif key in PATHS and isinstance(value, str):
+        yield Path(value)
+
+
 def _with_paths(value: Any, folder: Path, words: Mapping[str, str], key: str = "") -> Any:
     if isinstance(value, dict):
         return {name: _with_paths(item, folder, words, name) for name, item in value.items()}

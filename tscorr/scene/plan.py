@@ -148,8 +148,12 @@ def plan_scene(
     describe : of class map, confidence and surface.
     Raises ConfigError, MaterialError or InputError with all that is wrong, one thing a line.
     """
-    image = _image(settings)
     checks = Checks()
+    image = checks(_image, settings)
+    if image is None:  # the others cannot be laid over it, but some may be missing, too
+        for path in config.paths_of(settings):
+            checks(_check_exists, path)
+        checks.settle()
     class_map = checks(_class_map, settings, whole, image, describe)
     confidence = checks(_confidence, settings, image, describe)
     checks(_check_truth, settings.truth, image)
@@ -202,7 +206,7 @@ class Checks:
         self._errors: list[TscorrError] = []
 
     def __call__(self, check: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """What a check returns; where it fails None, which nobody sees: `settle` comes first."""
+        """What a check returns; where it fails None, which nobody uses: `settle` comes first."""
         try:
             return check(*args, **kwargs)
         except TscorrError as error:
@@ -224,6 +228,11 @@ def _check_difference(whole: config.Config, image: rasters.RasterInfo, stored: S
             f"output.corrected = 'vrt' cannot keep the nodata value {stored.nodata:g} of the floating-point image "
             f"{image.path}: what is removed may have that value too; allowed is 'file'"
         )
+
+
+def _check_exists(path: Path) -> None:
+    if not path.exists():
+        raise InputError(f"{path} does not exist")
 
 
 def _image(settings: config.Scene) -> rasters.RasterInfo:
