@@ -365,6 +365,25 @@ def test_geotiffs_keep_type_and_layout(tmp_path, dtype, interleave, bands):
         assert bands == 1 or after.interleaving == before.interleaving
 
 
+@pytest.mark.parametrize(
+    ("output", "name"),
+    [
+        ({}, "corrected.tif"),
+        ({"format": "cog"}, "corrected.tif"),
+        ({"format": "envi"}, "corrected.dat"),
+        ({"corrected": "vrt"}, "corrected.vrt"),
+    ],
+)
+def test_statistics_of_the_image_are_not_those_of_the_result(tmp_path, output, name):
+    image = write_raster(tmp_path / "image.tif", values_of("int16"), crs=UTM)
+    with rasterio.open(image, "r+") as file:
+        file.update_tags(1, STATISTICS_MAXIMUM="9000", sensor="left")
+    with rasterio.open(corrected(tmp_path, image, {"scale": 1e-4}, **output) / name) as result:
+        tags = result.tags(1)
+    assert not [key for key in tags if key.startswith("STATISTICS")]
+    assert tags.get("sensor") == ("left" if name != "corrected.dat" else None)
+
+
 @pytest.mark.parametrize("output", ["gtiff", "cog", "envi"])
 @pytest.mark.parametrize("interleave", ["bip", "pixel"])
 def test_three_hundred_bands(tmp_path, output, interleave):

@@ -218,8 +218,13 @@ def _scales(dataset: Any, fields: Mapping[str, str]) -> tuple[float, ...]:
 def _band_tags(
     dataset: Any, wavelengths_um: tuple[float, ...] | None, fwhm_um: tuple[float, ...] | None
 ) -> tuple[dict[str, dict[str, str]], ...]:
-    """Tags of each band by domain; with the given wavelengths instead of those that GDAL has rounded."""
+    """Tags of each band by domain; with the given wavelengths instead of those that GDAL has rounded.
+
+    Without the statistics that GDAL and QGIS leave there: those of a result would be others.
+    """
     tags = tuple({ns: dataset.tags(i, ns=ns) for ns in ("", "IMAGERY")} for i in dataset.indexes)
+    for band in tags:
+        band[""] = {key: value for key, value in band[""].items() if not key.startswith("STATISTICS_")}
     for key, values in (("CENTRAL_WAVELENGTH_UM", wavelengths_um), ("FWHM_UM", fwhm_um)):
         for band, value in zip(tags, values or (), strict=False):
             band["IMAGERY"][key] = str(value)
