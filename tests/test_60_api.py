@@ -155,7 +155,7 @@ def test_correct_refuses_fields_that_mean_nothing(name, values, message):
         ("direct_fraction", 0.8, "a list of shares from 0 to 1"),
         ("direct_fraction", (), "a list of shares from 0 to 1"),
         ("uncorrectable_share", 0, "a share above 0"),
-        ("max_zenith_deg", 90, "an angle above 0 and below 90"),
+        ("max_zenith_deg", 91, "an angle above 0, up to 90"),
         ("negligible_reflectance", np.nan, "a number from 0"),
         ("reference", (30.0, 80.0, 0.0), "two zenith angles from 0 to 75"),
         ("reference", (30.0,), "two zenith angles from 0 to 75"),

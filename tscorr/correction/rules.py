@@ -33,7 +33,7 @@ def _are_shares(values: Any) -> bool:
 LIMITS: Limits = {
     "negligible_reflectance": (lambda value: value >= 0, "a number from 0"),
     "uncorrectable_share": (lambda value: 0 < value <= 1, "a share above 0, up to 1"),
-    "max_zenith_deg": (lambda value: value is None or 0 < value < 90, "an angle above 0 and below 90"),
+    "max_zenith_deg": (lambda value: value is None or 0 < value <= 90, "an angle above 0, up to 90"),
     "direct_fraction": (_are_shares, SHARES),
     "direct_fraction_sigma": (_are_shares, SHARES),
     "reference": (
