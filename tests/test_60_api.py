@@ -151,9 +151,9 @@ def test_correct_refuses_fields_that_mean_nothing(name, values, message):
         ("form", "simple", r"'full', 'simplified' \(did you mean 'simplified'\?\)"),
         ("method", "substract", r"'subtract', 'ratio', 'reference' \(did you mean 'subtract'\?\)"),
         ("uncorrectable", None, "'best', 'keep', 'nodata'"),
-        ("direct_fraction", (1.2,), "a list of shares from 0 to 1"),
-        ("direct_fraction", 0.8, "a list of shares from 0 to 1"),
-        ("direct_fraction", (), "a list of shares from 0 to 1"),
+        ("direct_fraction", (1.2,), "a share from 0 to 1, or a list"),
+        ("direct_fraction", 1.2, "a share from 0 to 1, or a list"),
+        ("direct_fraction", (), "a share from 0 to 1, or a list"),
         ("uncorrectable_share", 0, "a share above 0"),
         ("max_zenith_deg", 91, "an angle above 0, up to 90"),
         ("negligible_reflectance", np.nan, "a number from 0"),
@@ -165,6 +165,13 @@ def test_correct_refuses_fields_that_mean_nothing(name, values, message):
 def test_rules_refuse_what_they_do_not_know(name, value, allowed):
     with pytest.raises(ConfigError, match=f"{name} = .*; allowed (is|are) {allowed}"):
         tscorr.Rules(**{name: value})
+
+
+def test_rules_take_one_share_for_all_bands_and_plain_directions():
+    plain = tscorr.Rules(direct_fraction=0.8, method="reference", reference=(30.0, 5.0, 90.0))
+    assert plain.direct_fraction == (0.8,)
+    assert plain.reference.relative_azimuth_deg == 90.0
+    assert tscorr.correct(IMAGE, CLASSES, TILE, *PEAK, rules=plain).corrected.shape == IMAGE.shape
 
 
 def test_a_form_that_is_none_is_refused_everywhere():

@@ -1,6 +1,7 @@
 """How the peak of a material is taken out, and what the stored values of an image mean."""
 
 from dataclasses import dataclass, fields
+from numbers import Real
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import numpy as np
@@ -23,7 +24,7 @@ class ReferenceDirections(NamedTuple):
 REFERENCE = ReferenceDirections()
 
 
-SHARES = "a list of shares from 0 to 1: one, or one a band"
+SHARES = "a share from 0 to 1, or a list of shares, one a band"
 
 
 def _are_shares(values: Any) -> bool:
@@ -37,7 +38,7 @@ LIMITS: Limits = {
     "direct_fraction": (_are_shares, SHARES),
     "direct_fraction_sigma": (_are_shares, SHARES),
     "reference": (
-        lambda value: 0 <= value[0] <= 75 and 0 <= value[1] <= 75 and 0 <= value[2] <= 180,
+        lambda value: len(value) == 3 and max(value[:2]) <= 75 and value[2] <= 180 and min(value) >= 0,
         "two zenith angles from 0 to 75 and a relative azimuth from 0 to 180",
     ),
     "normal_sigma_deg": (lambda value: value is None or 0 <= value <= 45, "an angle from 0 to 45"),
@@ -71,6 +72,9 @@ class Rules:
     enabled: bool = True
 
     def __post_init__(self) -> None:
+        for name in ("direct_fraction", "direct_fraction_sigma"):
+            if isinstance(getattr(self, name), Real):  # one number for all bands
+                object.__setattr__(self, name, (getattr(self, name),))
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         for field in fields(self):
             choices = get_args(field.type) if get_origin(field.type) is Literal else ()
@@ -78,6 +82,7 @@ class Rules:
                 allowed = f"{', '.join(map(repr, choices))}{nearest(str(values[field.name]), choices)}"
                 raise ConfigError(f"{field.name} = {values[field.name]!r}; allowed are {allowed}")
         check_values(values, LIMITS, ConfigError)
+        object.__setattr__(self, "reference", ReferenceDirections(*self.reference))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
