@@ -157,6 +157,24 @@ def convergences_deg(grid: Grid, x: Any, y: Any) -> Array:
     return -np.rad2deg(np.arctan2(xs[1] - xs[0], ys[1] - ys[0]))
 
 
+def point_scales(grid: Grid) -> tuple[float, float]:
+    """How many units of the grid a metre on the ground is, along x and along y, at the grid's centre.
+
+    From two points 50 units away, on the ellipsoid WGS 84. 1.0000 +- 0.001 in UTM; 1 / cos(latitude) in Web Mercator.
+    """
+    x, y = grid.center
+    step = 50.0
+    longitude, latitude = longitude_latitude(grid, x + np.array([0.0, step, 0.0]), y + np.array([0.0, 0.0, step]))
+    phi = np.deg2rad(latitude[0])
+    bent = 1 - ECCENTRICITY2 * np.sin(phi) ** 2
+    north = np.deg2rad(latitude[1:] - latitude[0]) * SEMI_MAJOR_M * (1 - ECCENTRICITY2) / bent**1.5
+    east = np.deg2rad(longitude[1:] - longitude[0]) * SEMI_MAJOR_M * np.cos(phi) / np.sqrt(bent)
+    along_x, along_y = step / np.hypot(east, north)
+    return float(along_x), float(along_y)
+
+
+SEMI_MAJOR_M, ECCENTRICITY2 = 6_378_137.0, 0.0066943799901413
+"""of WGS 84"""
 NORTH_NODES = 9
 
 

@@ -13,7 +13,7 @@ from rasterio.enums import ColorInterp, Interleaving
 from rasterio.warp import transform_bounds
 
 from tscorr.errors import InputError
-from tscorr.grid import Block, Grid
+from tscorr.grid import Block, Grid, point_scales
 from tscorr.rasters import envi
 from tscorr.rasters.envi import PixelByPixel
 from tscorr.rasters.sound import GDAL_ERRORS, check_sound, open_dataset
@@ -289,13 +289,28 @@ def check_overlap(raster: RasterInfo, image: RasterInfo, what: str) -> None:
 
 
 def check_metric(raster: RasterInfo, what: str) -> None:
-    """Raise InputError unless the CRS is projected, in metres: slopes and shadows need true lengths."""
+    """Raise InputError unless the CRS is projected, in metres, as heights are."""
     crs = raster.grid.crs
     if crs is None:
         raise InputError(f"{what} {raster.path} has no CRS; allowed is a projected CRS in metres")
     if crs.is_geographic or crs.linear_units_factor[1] != 1.0:
         unit = "degrees" if crs.is_geographic else crs.linear_units
         raise InputError(f"{what} {raster.path} is in {unit}; allowed is a projected CRS in metres")
+
+
+TRUE_TO = 0.05
+"""of lengths; 0.001 in UTM and national grids, 0.03 in those of continents, 0.5 in Web Mercator at 48 degrees"""
+
+
+def check_true_lengths(image: RasterInfo, why: str) -> None:
+    """Raise InputError unless a metre of the image's CRS is a metre on the ground; `why` says what needs that."""
+    check_metric(image, f"{why} the image")
+    for scale in point_scales(image.grid):
+        if not abs(scale - 1) <= TRUE_TO:
+            raise InputError(
+                f"{why} the image {image.path} is in {str(image.grid.crs).split('[')[0]}, where a metre on the "
+                f"ground is {scale:.3f}; allowed is a projected CRS whose metres are true to 5 %, such as UTM"
+            )
 
 
 def _bounds(grid: Grid) -> tuple[float, float, float, float]:

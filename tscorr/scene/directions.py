@@ -54,6 +54,9 @@ class Seen(NamedTuple):
 def view_of(settings: Any, image: rasters.RasterInfo) -> Seen:
     """The view of a scene; raises ConfigError or InputError with the first thing that is wrong."""
     grid = image.grid
+    with_positions = config.FrameViewSettings | config.LineViewSettings | config.MosaicViewSettings
+    if isinstance(settings, with_positions) and grid.crs is not None:
+        rasters.check_true_lengths(image, "seen from positions,")
     if isinstance(settings, config.ConstantViewSettings):
         return Seen(ConstantView(settings.zenith_deg, settings.azimuth_deg))
     if isinstance(settings, config.FrameViewSettings):

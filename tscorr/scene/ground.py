@@ -1,6 +1,8 @@
 """The ground of a scene: its surface, and what is in shadow or hidden, over the pixels of the image."""
 
+import math
 import threading
+import warnings
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from functools import partial
@@ -14,7 +16,7 @@ from rasterio.enums import Resampling
 from tscorr import config, rasters
 from tscorr.correction.edges import dilated, rim
 from tscorr.errors import InputError, OutputError
-from tscorr.grid import Block
+from tscorr.grid import Block, blocks
 from tscorr.scene.directions import obs_normals
 from tscorr.scene.plan import Scene
 from tscorr.sensor import ConstantView, FrameView, LineView
@@ -34,7 +36,11 @@ SAMPLES = 4
 """the survey looks at SAMPLES x SAMPLES windows of SAMPLE_PX"""
 MARGIN_PX = 512
 """pixels around the image that are looked at for what they hide; farther things cast no shadow"""
-LIT, SEEN = "lit.bits", "seen.bits"
+TALLEST_M = 300.0
+"""above the ground around it: what stands beyond the image is taken to be no taller, whatever it is"""
+STEEPEST_DEG = 80.0
+"""beyond it what hides a pixel is further than MARGIN_PX anyway"""
+LIT, SEEN, RELIEF = "lit.bits", "seen.bits", "relief.txt"
 
 
 class Ground:
@@ -89,14 +95,14 @@ class Ground:
         """The surface; its heights are surveyed when it is first asked for."""
         with self._lock:
             if self._known_surface is None:
-                level_m, self._relief_m, noise_m = self._survey()
+                level_m, noise_m = self._survey()
                 self._known_surface = self._surface(level_m, noise_m)
             return self._known_surface
 
-    def _survey(self) -> tuple[float, float, float]:
-        """Middle height, relief and noise of the surface, from windows spread over the scene. [m]"""
+    def _survey(self) -> tuple[float, float]:
+        """Middle height and noise of the surface, from windows spread over the scene. [m]"""
         if self._heights is None:
-            return 0.0, 0.0, 0.0
+            return 0.0, 0.0
         rows, cols = self._scene.image.shape
         corners = {
             (
@@ -114,7 +120,7 @@ class Ground:
         if not heights.size:
             raise InputError(f"the surface model {self._heights.info.path} holds no heights under the image")
         noise = float(np.median([height_noise(window) for window in windows]))
-        return float(np.median(heights)), float(np.ptp(heights)), noise
+        return float(np.median(heights)), noise
 
     def _surface(self, level_m: float, noise_m: float) -> Surface:
         settings = self._scene.settings.surface
@@ -155,11 +161,15 @@ class Ground:
             return
         if masks is not None:
             self._lit, self._seen = (self._loaded(masks / name) for name in (LIT, SEEN))
+            if (masks / RELIEF).exists():
+                self._relief_m = float((masks / RELIEF).read_text(encoding="ascii"))
             return
-        assert self.surface is not None  # surveyed: the sweeps want its relief
         self._rows = rows
-        self._lit = self._swept(lambda **scene: shadows.DirectionSweep(direction=self._sun(), **scene), self._sun())
+        sun = self._scene.sun.center
+        self._lit = self._swept(lambda _, **scene: shadows.DirectionSweep(direction=sun, **scene), _zenith_deg(sun))
         self._seen = self._seen_mask()
+        if self._seen is None:
+            self._relief_m = self._relief()
 
     def _loaded(self, path: Path) -> BitMask | None:
         """A mask that was saved, or None where there is none."""
@@ -172,38 +182,56 @@ class Ground:
         for name, mask in ((LIT, self._lit), (SEEN, self._seen)):
             if mask is not None:
                 mask.save(folder / name)
-
-    def _sun(self) -> Array:
-        return self._scene.sun.center
+        (folder / RELIEF).write_text(repr(self._relief_m), encoding="ascii")
 
     def _seen_mask(self) -> BitMask | None:
         """What a sensor sees, where one sweep can tell; otherwise it is found block by block."""
         view, grid = self._scene.view, self._scene.grid
         if isinstance(view, ConstantView):
             direction = view.vectors(grid, Block(0, 0, 1, 1), np.zeros((1, 1)))[:, 0, 0]
-            return self._swept(lambda **scene: shadows.DirectionSweep(direction=direction, **scene), direction)
+            return self._swept(
+                lambda _, **scene: shadows.DirectionSweep(direction=direction, **scene), _zenith_deg(direction)
+            )
         if isinstance(view, FrameView):
-            return self._swept(lambda **scene: shadows.FrameSweep(position=self._local(view.position), **scene))
+            position = view.position
+            return self._swept(
+                lambda local, **scene: shadows.FrameSweep(position=local(position), **scene), self._steepest_deg()
+            )
         if isinstance(view, LineView) and (ends := view.straight(grid)) is not None:
-            start, end = map(self._local, ends)
-            return self._swept(lambda **scene: shadows.LineSweep(start=start, end=end, **scene))
+            return self._swept(
+                lambda local, **scene: shadows.LineSweep(start=local(ends[0]), end=local(ends[1]), **scene),
+                self._steepest_deg(),
+            )
         return None
 
-    def _local(self, position: Any) -> tuple[float, float, float]:
-        """A position relative to the centre of the image's first pixel: metres east, north, and up."""
-        x0, y0 = self._scene.grid.xy(0, 0)
-        return float(position[0] - x0), float(position[1] - y0), float(position[2])
+    def _steepest_deg(self) -> float:
+        """The largest zenith angle of the view, at the corners of the image and between them."""
+        rows, cols = self._scene.image.shape
+        places = {(row, col) for row in (0, rows // 2, rows - 1) for col in (0, cols // 2, cols - 1)}
+        zeniths = [
+            _zenith_deg(self._scene.view.vectors(self._scene.grid, block, self.surface.heights(block))[:, 0, 0])
+            for block in (Block(row, col, 1, 1) for row, col in places)
+        ]
+        return max((zenith for zenith in zeniths if np.isfinite(zenith)), default=0.0)
 
-    def _swept(self, sweep_of: Callable[..., shadows.Sweep], direction: Array | None = None) -> BitMask:
-        """The mask of a sweep over the image, and over what lies around it towards the source.
+    def _swept(self, sweep_of: Callable[..., shadows.Sweep], zenith_deg: float) -> BitMask:
+        """The mask of a sweep over the image, and over what lies around it and may hide something in it.
 
+        sweep_of   : given a function that puts a position into the place of what is swept, and its shape and cells.
+        zenith_deg : of the source, at most.
         OutputError where the disk has no room for it.
         """
         rows, cols = self._scene.image.shape
         cell_x_m, cell_y_m = self._scene.grid.cell_size
-        margin = self._margin(direction)
+        margin = self._margin(zenith_deg)
+        x0, y0 = self._scene.grid.xy(-margin, -margin)
+
+        def local(position: Any) -> tuple[float, float, float]:
+            """Relative to the centre of the first pixel: metres east, north, and up."""
+            return float(position[0] - x0), float(position[1] - y0), float(position[2])
+
         shape = rows + 2 * margin, cols + 2 * margin
-        sweep = sweep_of(shape=shape, cell_x_m=cell_x_m, cell_y_m=cell_y_m)
+        sweep = sweep_of(local, shape=shape, cell_x_m=cell_x_m, cell_y_m=cell_y_m)
         lines = next((lines for lines in STRIP_ROWS if lines * max(shape) <= STRIP_PIXELS), STRIP_ROWS[-1])
         first, last = self._rows or (0, rows)
         try:
@@ -215,13 +243,30 @@ class Ground:
             raise OutputError(f"the mask of shadows cannot be written to {self._folder}: {error}") from None
         return mask
 
-    def _margin(self, direction: Array | None) -> int:
-        """Pixels around the image that can hide something in it from a source in this direction."""
-        if direction is None or not self._reaches_beyond():
-            return 0
-        zenith = np.rad2deg(np.arctan2(np.hypot(direction[0], direction[1]), direction[2]))
-        reach = shadows.reach_m(self._relief_m, float(zenith)) / min(self._scene.grid.cell_size)
-        return min(MARGIN_PX, int(np.ceil(reach)) + 1)
+    def _margin(self, zenith_deg: float) -> int:
+        """Pixels around the image that can hide something in it from a source at this zenith angle."""
+        return self._reach_px(TALLEST_M, zenith_deg) if self._reaches_beyond() else 0
+
+    def _reach_px(self, relief_m: float, zenith_deg: float) -> int:
+        """How far something may be that hides a pixel."""
+        reach = shadows.reach_m(relief_m, min(zenith_deg, STEEPEST_DEG)) / min(self._scene.grid.cell_size)
+        return min(MARGIN_PX, math.ceil(reach) + 1)
+
+    def _relief(self) -> float:
+        """From the lowest to the highest point of the surface model, about the rows that will be asked for. [m]"""
+        rows, cols = self._scene.image.shape
+        first, last = self._rows or (0, rows)
+        beyond = MARGIN_PX if self._reaches_beyond() else 0
+        first, last = max(first - MARGIN_PX, -beyond), min(last + MARGIN_PX, rows + beyond)
+        lowest, highest = np.inf, -np.inf
+        for block in blocks((last - first, cols + 2 * beyond), (SAMPLE_PX * 2, SAMPLE_PX * 8)):
+            heights = self._read_heights(Block(block.row + first, block.col - beyond, block.height, block.width))
+            with warnings.catch_warnings():
+                warnings.simplefilter(
+                    "ignore", RuntimeWarning
+                )  # nothing but voids: nan, which fmin and fmax leave out
+                lowest, highest = np.fmin(lowest, np.nanmin(heights)), np.fmax(highest, np.nanmax(heights))
+        return float(max(highest - lowest, 0.0))
 
     def _reaches_beyond(self) -> bool:
         """Whether the surface model covers more than the image."""
@@ -265,11 +310,17 @@ class Ground:
         """Which pixels of a block the sensor sees, ray by ray."""
         grid = self._scene.grid
         view = self._scene.view.vectors(grid, block, self.surface.heights(block))
-        zenith = float(np.rad2deg(np.arctan2(np.hypot(view[0], view[1]), view[2])).max())
-        cell_x_m, cell_y_m = grid.cell_size
-        reach = shadows.reach_m(self._relief_m, min(zenith, 80.0)) / min(cell_x_m, cell_y_m)
-        halo = min(MARGIN_PX, int(np.ceil(reach)) + 1)
+        zenith = float(np.nanmax(np.rad2deg(np.arctan2(np.hypot(view[0], view[1]), view[2])), initial=0.0))
+        halo = self._reach_px(self._relief_m, zenith)
         window = slice(halo, halo + block.height), slice(halo, halo + block.width)
+        cell_x_m, cell_y_m = grid.cell_size
         assert self._shared_heights is not None
         heights = self._shared_heights(block.padded(halo))
-        return shadows.march(heights, view, cell_x_m=cell_x_m, cell_y_m=cell_y_m, window=window, needed=needed)
+        return shadows.march(
+            heights, view, cell_x_m=cell_x_m, cell_y_m=cell_y_m, window=window, needed=needed, reach_px=halo
+        )
+
+
+def _zenith_deg(direction: Array) -> float:
+    """Of a vector east, north, up."""
+    return float(np.rad2deg(np.arctan2(np.hypot(direction[0], direction[1]), direction[2])))

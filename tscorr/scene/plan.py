@@ -318,7 +318,7 @@ def _each_surface_file(settings: Any, image: rasters.RasterInfo, describe: Descr
         if dsm.bands != 1:
             raise InputError(f"the surface model {dsm.path} has {dsm.bands} bands; allowed is one")
         rasters.check_metric(dsm, "the surface model")
-        rasters.check_metric(image, "the image")
+        rasters.check_true_lengths(image, "with a surface model,")
         rasters.check_overlap(dsm, image, "the surface model")
         if not image.grid.is_north_up:
             raise InputError(f"the image {image.path} is turned on its grid; with a surface model, north must be up")

@@ -291,6 +291,7 @@ def march(
     cell_y_m: float,
     window: tuple[slice, slice] = (slice(None), slice(None)),
     needed: Mask | None = None,
+    reach_px: int | None = None,
     tolerance_m: float = TOLERANCE_M,
 ) -> Mask:
     """Which pixels of the window see their source: a ray from each, until it is above the relief.
@@ -299,6 +300,7 @@ def march(
     direction : (3,) or (3, *window shape), from the surface to the source, of any length; towards
                 nan, the horizon and below it nothing is seen.
     needed    : which pixels of the window to answer for; the others are given as visible.
+    reach_px  : lines of pixels that a ray goes over at most, which is no more than the halo has; None: no end.
 
     Raises InputError where shapes do not agree and for impossible cells.
     """
@@ -325,6 +327,7 @@ def march(
         first=(rows.start, cols.start),
         cell=(float(cell_x_m), float(cell_y_m)),
         tolerance=float(tolerance_m),
+        reach=float(sum(heights.shape) if reach_px is None else reach_px),
         visible=visible,
     )
     return visible

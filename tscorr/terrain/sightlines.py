@@ -175,10 +175,10 @@ def peaks(heights):
 
 
 @njit(**LOOP)
-def march(heights, tile_peaks, highest, direction, needed, first, cell, tolerance, visible):
+def march(heights, tile_peaks, highest, direction, needed, first, cell, tolerance, reach, visible):
     """Set in `visible` whether each needed pixel of a window sees its source.
 
-    first : the window's first pixel, in the heights; highest : of `tile_peaks`.
+    first : the window's first pixel, in the heights; highest : of `tile_peaks`; reach : of a ray, lines of pixels.
     """
     for r in range(needed.shape[0]):
         for c in range(needed.shape[1]):
@@ -189,12 +189,12 @@ def march(heights, tile_peaks, highest, direction, needed, first, cell, toleranc
                 right = np.float64(direction[0, r, c]) / cell[0]
                 up = np.float64(direction[2, r, c])
                 visible[r, c] = up > 0.0 and _is_free(
-                    heights, tile_peaks, row, col, down, right, up, cell, highest, height + tolerance
+                    heights, tile_peaks, row, col, down, right, up, cell, highest, height + tolerance, reach
                 )
 
 
 @njit(**PART)
-def _is_free(heights, tile_peaks, row, col, down, right, up, cell, highest, eye):
+def _is_free(heights, tile_peaks, row, col, down, right, up, cell, highest, eye, reach):
     """Whether the ray that leaves a pixel at the height `eye` meets nothing; `down`, `right` in pixels."""
     by_rows = abs(down) >= abs(right)
     lines = abs(down) if by_rows else abs(right)
@@ -204,7 +204,7 @@ def _is_free(heights, tile_peaks, row, col, down, right, up, cell, highest, eye)
     wall_along = WALL_SLOPE * math.hypot(down * cell[1], right * cell[0])
     wall_across = WALL_SLOPE * (cell[0] if by_rows else cell[1])
     rows, cols = heights.shape
-    last = int(min((highest - eye) / rise + 1.0, rows + cols))
+    last = int(min((highest - eye) / rise + 1.0, reach))
     before = np.float64(heights[row, col])
     n = 1
     while n <= last:
