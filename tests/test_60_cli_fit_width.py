@@ -59,6 +59,18 @@ def test_fit_does_not_write_what_did_not_converge(measured, tmp_path, monkeypatc
     assert not (tmp_path / "m.toml").exists()
 
 
+def test_fit_does_not_replace_other_materials(measured, tmp_path):
+    library = tmp_path / "mine.toml"
+    library.write_text("[other]\nt0 = 0.1\nt1 = 0.1\nw = 0.1\nn = 1.5\n")
+    before = library.read_bytes()
+    assert f"the library {library} holds other, which would be lost" in refused("fit", measured, "-o", library)
+    assert library.read_bytes() == before
+    library.write_text("scale = 3\n")
+    assert f"the file {library} exists and is no library of materials" in refused("fit", measured, "-o", library)
+    again = tmp_path / "again.toml"
+    assert run("fit", measured, "-o", again).exit_code == run("fit", measured, "-o", again).exit_code == 0
+
+
 def test_fit_says_how_many_samples_it_used(measured):
     forward = len(measured.read_text().splitlines()) - 1
     with measured.open("a", encoding="utf-8") as file:

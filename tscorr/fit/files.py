@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from tscorr.errors import InputError
 from tscorr.fit.fitting import FitSettings, fit_measurements
-from tscorr.fit.library import save_converged
+from tscorr.fit.library import check_replaceable, save_converged
 from tscorr.fit.measurements import Measurements, merge
 from tscorr.fit.readers import read_measurements
 from tscorr.fit.result import FitResult
@@ -33,7 +33,7 @@ def fit_files(
     """Fit the measurements of files: one material a file, named by its stem.
 
     paths          : `.csv` or Cornell `.brdf`
-    output         : material file to write, ready for `[materials] library`
+    output         : material file to write, ready for `[materials] library`; not one that holds other materials
     name           : the material's name; several files are then measurements of this one surface
     wavelengths_um : only these; each must have been measured
     plot_directory : where to draw curves and residuals
@@ -44,9 +44,11 @@ def fit_files(
     if output is not None and Path(output).resolve() in {Path(path).resolve() for path in paths}:
         raise InputError(f"the material file {output} is one of the files of measurements; allowed is another name")
     settings = settings or FitSettings()
+    by_material = _by_material(paths, name)
+    check_replaceable(output, by_material)
     results = {
         key: fit_measurements(measured if wavelengths_um is None else measured.at(wavelengths_um), settings, key)
-        for key, measured in _by_material(paths, name).items()
+        for key, measured in by_material.items()
     }
     unfinished = save_converged(results, output)
     if plot_directory is not None:

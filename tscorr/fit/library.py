@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 import tomli_w
 
-from tscorr.errors import OutputError
-from tscorr.materials import PARAMETERS, Material
+from tscorr.errors import InputError, MaterialError, OutputError
+from tscorr.materials import PARAMETERS, Material, load_materials
 
 HEAD = "# Torrance-Sparrow parameters: t0, t1 in 1/sr, w in 1/degree; the covariance is that of t0, t1, w, n\n"
 
@@ -29,6 +29,21 @@ def save_materials(materials: Iterable[Material], path: str | Path) -> None:
     except OSError as error:
         hidden.unlink(missing_ok=True)
         raise OutputError(f"the materials {path} cannot be written: {error}") from None
+
+
+def check_replaceable(path: str | Path | None, names: Iterable[str]) -> None:
+    """Raise InputError where a file exists that holds anything but materials of these names, which would be lost."""
+    if path is None or not Path(path).exists():
+        return
+    try:
+        others = sorted(set(load_materials(path)) - set(names))
+    except MaterialError as error:
+        raise InputError(f"the file {path} exists and is no library of materials ({error}); name another") from None
+    if others:
+        raise InputError(
+            f"the library {path} holds {', '.join(others)}, which would be lost; allowed is a file of its own: "
+            f"[materials] library takes several"
+        )
 
 
 class Fitted(Protocol):

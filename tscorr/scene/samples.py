@@ -19,7 +19,7 @@ from tscorr.angles import facet_angles
 from tscorr.correction import BlockInputs, class_rows
 from tscorr.errors import InputError
 from tscorr.fit.images import ImageSamples, merged
-from tscorr.fit.library import save_converged
+from tscorr.fit.library import check_replaceable, save_converged
 from tscorr.fit.scene_result import SceneFit
 from tscorr.fit.scenes import MIN_SAMPLES, SceneFitSettings, fit_samples
 from tscorr.grid import Block
@@ -66,6 +66,7 @@ def fit_scenes(
     where the scenes differ in their bands, or where no material can be fitted; then nothing is written.
     """
     settings = settings or SceneFitSettings()
+    check_replaceable(output, {surface.name for scene in scenes for surface, _, _ in scene.materials})
     gathered = gather(scenes, seed=settings.seed, progress=progress)
     results = {
         name: fit_samples(samples, settings) for name, samples in gathered.items() if len(samples) >= MIN_SAMPLES
