@@ -136,6 +136,8 @@ def test_correct_refuses_numbers_that_mean_nothing(name, value, allowed):
         ("weight", np.full((3, 4), 1.5), "weight holds 1.5; allowed is 0 to 1"),
         ("weight", np.full((3, 4), np.nan), "weight holds nan; allowed is 0 to 1"),
         ("weight", "x", "weight is <U1"),
+        ("shadowed", np.full((3, 4), 0.5), "shadowed holds 0.5; allowed is true and false"),
+        ("hidden", np.full((3, 4), np.nan), "hidden holds nan; allowed is true and false"),
         ("normal_sigma_deg", -1.0, "normal_sigma_deg holds -1; allowed is 0 to 45"),
         ("normal_sigma_deg", np.full((3, 4), 50.0), "normal_sigma_deg holds 50; allowed is 0 to 45"),
     ],
@@ -151,6 +153,7 @@ def test_correct_refuses_fields_that_mean_nothing(name, values, message):
         ("form", "simple", r"'full', 'simplified' \(did you mean 'simplified'\?\)"),
         ("method", "substract", r"'subtract', 'ratio', 'reference' \(did you mean 'subtract'\?\)"),
         ("uncorrectable", None, "'best', 'keep', 'nodata'"),
+        ("sky_specular", "no", "True, False"),
         ("direct_fraction", (1.2,), "a share from 0 to 1, or a list"),
         ("direct_fraction", 1.2, "a share from 0 to 1, or a list"),
         ("direct_fraction", (), "a share from 0 to 1, or a list"),
@@ -165,6 +168,85 @@ def test_correct_refuses_fields_that_mean_nothing(name, values, message):
 def test_rules_refuse_what_they_do_not_know(name, value, allowed):
     with pytest.raises(ConfigError, match=f"{name} = .*; allowed (is|are) {allowed}"):
         tscorr.Rules(**{name: value})
+
+
+def test_masked_pixels_have_no_data():
+    masked = np.ma.masked_array(IMAGE, mask=np.zeros(IMAGE.shape, bool))
+    masked[:, 0, 1] = np.ma.masked
+    result = tscorr.correct(masked, CLASSES, TILE, *PEAK)
+    assert result.flags[0, 1] & tscorr.PixelFlag.NODATA
+    assert np.isnan(result.corrected[:, 0, 1]).all()
+    plain = tscorr.correct(IMAGE, CLASSES, TILE, *PEAK)
+    np.testing.assert_array_equal(result.corrected[:, 1:], plain.corrected[:, 1:])
+    counts = (masked * 1e4).astype(np.uint16)
+    with pytest.raises(InputError, match="an image of uint16 has masked values; give the nodata"):
+        tscorr.correct(counts, CLASSES, TILE, *PEAK, scale=1e-4)
+    assert tscorr.correct(counts, CLASSES, TILE, *PEAK, scale=1e-4, nodata=0).corrected[0, 0, 1] == 0
+
+
+def test_masked_classes_are_no_material():
+    classes = np.ma.masked_array(CLASSES, mask=CLASSES == 0)
+    classes[1, 2] = np.ma.masked
+    flags = tscorr.correct(IMAGE, classes, TILE, *PEAK).flags
+    assert np.argwhere(flags & tscorr.PixelFlag.NO_MATERIAL).tolist() == [[1, 2]]
+
+
+def test_other_coordinates_are_refused():
+    xarray = pytest.importorskip("xarray")
+    image = xarray.DataArray(IMAGE, dims=("band", "y", "x"), coords={"y": [3, 2, 1]})
+    classes = xarray.DataArray(CLASSES, dims=("y", "x"), coords={"y": [1, 2, 3]})
+    with pytest.raises(InputError, match="classes and the image have different coordinates y; align them first"):
+        tscorr.correct(image, classes, TILE, *PEAK)
+    tscorr.correct(image, classes.assign_coords(y=[3, 2, 1]), TILE, *PEAK)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: tscorr.material(None), "asked for as None; allowed is the name of one"),
+        (lambda: tscorr.azimuthal_width(None, 30), "asked for as None; allowed is the name of one"),
+        (
+            lambda: tscorr.brdf("roof_tile", [10, 20], [1, 2, 3], 180),
+            "incidence, exitance and relative azimuth: .*shape",
+        ),
+        (lambda: tscorr.brdf("roof_tile", "x", 3, 180), "incidence, exitance and relative azimuth: could not convert"),
+        (
+            lambda: tscorr.brdf("roof_tile", 10, 10, 180, wavelength_um=550),
+            r"wavelength_um = \[550\]; allowed is 0.1 to",
+        ),
+        (lambda: tscorr.correct(IMAGE, CLASSES, ["roof_tile"], *PEAK), "materials is a mapping"),
+        (lambda: tscorr.correct(IMAGE, CLASSES, TILE, *PEAK, rules={}), "rules are Rules"),
+        (
+            lambda: tscorr.correct(IMAGE, CLASSES, TILE, *PEAK, wavelength_um=(500, 600)),
+            "wavelength_um = .*; allowed is",
+        ),
+        (lambda: tscorr.correct(IMAGE[:0], CLASSES, TILE, *PEAK), "do not fit"),
+        (lambda: tscorr.correct(IMAGE, CLASSES, TILE, [np.nan] * 3, PEAK[1]), "sun is nan everywhere"),
+        (lambda: tscorr.specular_state([0.5]), "flags are float64; allowed are integers"),
+        (lambda: tscorr.run(None), "asked for as None; allowed is the path of a file"),
+        (lambda: tscorr.Material("a", ("x",), (0.1,), (0.1,), (1.5,)), "t0 = .*; allowed are numbers"),
+    ],
+)
+def test_what_means_nothing_is_refused_in_words(call, message):
+    with pytest.raises(tscorr.TscorrError, match=message):
+        call()
+
+
+@pytest.mark.usefixtures("folder")
+def test_one_name_serves_where_several_may_be_given():
+    result = tscorr.run("city.toml", scenes="roofs", materials="roof_tile")
+    assert [scene.name for scene in result.scenes] == ["roofs"]
+    assert len(repr(result)) < 500
+    with pytest.raises(ConfigError, match="workers = -1"):
+        tscorr.run("city.toml", workers=-1)
+
+
+def test_angles_below_zero_have_no_brdf():
+    assert np.isnan(tscorr.brdf("roof_tile", [-50, 50], [50, -50], 180)).all()
+
+
+def test_numbers_make_a_material():
+    assert tscorr.Material("a", 0.1, 0.2, 0.05, 1.5, wavelength_um=0.55).t1 == (0.2,)
 
 
 def test_rules_take_one_share_for_all_bands_and_plain_directions():

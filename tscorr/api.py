@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from tscorr import reference
 from tscorr.correction import BlockInputs, Corrector, Entry, Rules, Stored, check_ratio, class_rows
 from tscorr.errors import InputError, Limits, check_values
-from tscorr.materials import Material, material
+from tscorr.materials import ALLOWED_WAVELENGTHS, Material, is_wavelength, material
 from tscorr.width import is_simplified
 
 Array = NDArray[Any]
@@ -36,10 +36,17 @@ def brdf(
     >>> float(round(brdf("roof_tile", 50, 50, 180)[()], 6))
     0.075591
     """
-    known = material(surface) if isinstance(surface, str) else surface
-    parameters = known.at(None if wavelength_um is None else [wavelength_um])
-    angles = [np.asarray(angle, dtype=float) for angle in (incidence_deg, exitance_deg, relative_azimuth_deg)]
-    geometry = reference.geometry_from_angles(*np.broadcast_arrays(*angles))
+    known = surface if isinstance(surface, Material) else material(surface)
+    wavelengths = None if wavelength_um is None else [wavelength_um]
+    _check_wavelengths(wavelengths)
+    parameters = known.at(wavelengths)
+    try:
+        given = [np.asarray(angle, dtype=float) for angle in (incidence_deg, exitance_deg, relative_azimuth_deg)]
+        incidence, exitance, azimuth = np.broadcast_arrays(*given)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"incidence, exitance and relative azimuth: {error}; allowed are numbers [degrees]") from None
+    upright = np.where((incidence >= 0) & (exitance >= 0), 0.0, np.nan)
+    geometry = reference.geometry_from_angles(incidence + upright, exitance, azimuth)
     t0, t1, w, n, k = (getattr(parameters, name)[0] for name in ("t0", "t1", "w", "n", "k"))
     f_spec = reference.specular(geometry, w, n, k, simplified=is_simplified(form))
     return reference.brdf(f_spec, t0, t1)
@@ -110,8 +117,9 @@ def correct(
     image_noise : a, b of 1 sigma a + b R. normal_sigma_deg, direction_sigma_deg: 1 sigma of the normal, a number or
                 (rows, cols), and of the direction to the sensor, along each of two axes across them.
     Raises InputError where shapes or types do not fit, or where method = "ratio" lacks the t0 of a band. The input is
-    not changed. A DataArray of xarray comes back as DataArrays with its dimensions, (bands, rows, cols) or
-    (rows, cols) in this order, and coordinates.
+    not changed. Masked pixels have no data: nan stands there in the result, or of integers `nodata`. A DataArray of
+    xarray comes back as DataArrays with its dimensions, (bands, rows, cols) or (rows, cols) in this order, and
+    coordinates.
 
     The sun in the south and the sensor in the north, both at 40 degrees, over a tiled roof and the street beside it:
 
@@ -124,7 +132,7 @@ def correct(
     >>> specular_state(result.flags)  # corrected, negligible
     array([[1, 0]], dtype=uint16)
     """
-    image = np.asarray(reflectance_factor)
+    image = np.asarray(_filled(reflectance_factor, nodata))
     if image.dtype.name not in {"uint8", "int16", "uint16", "float32"}:
         if image.dtype.kind != "f":
             raise InputError(f"an image of {image.dtype}; allowed are uint8, int16, uint16 and floating point")
@@ -132,13 +140,18 @@ def correct(
     native = image.dtype.newbyteorder("=")
     cube = np.array(image[None] if image.ndim == 2 else image, dtype=native, order="C")
     class_map = np.asarray(classes)
-    if cube.ndim != 3 or class_map.shape != cube.shape[1:]:
+    if cube.ndim != 3 or class_map.shape != cube.shape[1:] or cube.size == 0:
         raise InputError(f"an image of shape {image.shape} and classes of shape {class_map.shape} do not fit")
     numbers = {"scale": scale, "offset": offset, "nodata": nodata, "saturation": saturation}
     sigmas = {"image_noise": image_noise, "direction_sigma_deg": direction_sigma_deg}
     check_values(numbers | sigmas, NUMBERS, InputError)
+    fields = {"shadowed": shadowed, "hidden": hidden, "weight": weight, "normal_sigma_deg": normal_sigma_deg}
+    _check_places(reflectance_factor, {"classes": classes, **fields})
     bands, shape = cube.shape[0], cube.shape[1:]
     settings = Rules() if rules is None else rules
+    if not isinstance(settings, Rules) or not isinstance(materials, Mapping):
+        raise InputError("materials is a mapping of classes to materials, and rules are Rules")
+    _check_wavelengths(wavelength_um)
     entries = [_entry(value, given, settings, wavelength_um, bands) for value, given in materials.items()]
     stored = Stored(
         dtype=cube.dtype,
@@ -149,11 +162,12 @@ def correct(
         noise=(image_noise,),
         direction_sigma_deg=direction_sigma_deg,
     )
-    rows = {value: row for row, value in enumerate(materials, start=1)}
+    rows = class_rows(class_map, {value: row for row, value in enumerate(materials, start=1)})
+    rows[np.ma.getmaskarray(classes) if isinstance(classes, np.ma.MaskedArray) else False] = 0
     sigma_shape = (1, 1) if np.ndim(np.asarray(normal_sigma_deg)) == 0 else shape
     inputs = BlockInputs(
         image=cube,
-        material=class_rows(class_map, rows),
+        material=rows,
         sun=_vectors("sun", sun, shape),
         view=_vectors("view", view, shape),
         normal=_vectors("normal", [0, 0, 1] if normal is None else normal, shape),
@@ -181,6 +195,36 @@ def _labelled(corrected: Array, removed: Array, flags: Array, sigma: Array | Non
     return CorrectionResult(image.copy(data=corrected), image.copy(data=removed), labelled_flags, labelled_sigma)
 
 
+def _check_wavelengths(wavelengths_um: Sequence[float] | None) -> None:
+    try:
+        right = wavelengths_um is None or all(map(is_wavelength, wavelengths_um))
+    except TypeError:
+        right = False
+    if not right:
+        raise InputError(f"wavelength_um = {wavelengths_um!r}; allowed is {ALLOWED_WAVELENGTHS}, one a band")
+
+
+def _filled(image: Any, nodata: float | None) -> Any:
+    """Masked values as nan, or of integers as nodata."""
+    if not np.ma.is_masked(image):
+        return image
+    if image.dtype.kind != "f" and nodata is None:
+        raise InputError(f"an image of {image.dtype} has masked values; give the nodata that stands for them")
+    return image.filled(np.nan if image.dtype.kind == "f" else nodata)
+
+
+def _check_places(image: Any, others: Mapping[str, Any]) -> None:
+    """Raise InputError where DataArrays have other coordinates than the image."""
+    xarray = sys.modules.get("xarray")
+    if xarray is None or not isinstance(image, xarray.DataArray):
+        return
+    for name, other in others.items():
+        for dim in image.dims[-2:] if isinstance(other, xarray.DataArray) else ():
+            known = dim in other.indexes and dim in image.indexes
+            if known and not other.indexes[dim].equals(image.indexes[dim]):
+                raise InputError(f"{name} and the image have different coordinates {dim}; align them first")
+
+
 def _entry(value: Any, given: Any, rules: Rules, wavelength_um: Sequence[float] | None, bands: int) -> Entry:
     """The material of a class and its parameters in each band."""
     surface = material(given) if isinstance(given, str) else given
@@ -198,16 +242,17 @@ def _field(
     if values is None:
         return None
     try:
-        field = np.broadcast_to(np.asarray(values, kind), shape)
+        field = np.broadcast_to(np.asarray(values, np.float32), shape)
     except (TypeError, ValueError):
         given = np.asarray(values)
         raise InputError(
             f"{name} is {given.dtype} of the shape {given.shape}; allowed are numbers of {shape}"
         ) from None
-    wrong = ~((field >= 0) & (field <= highest))
+    wrong = ~((field >= 0) & (field <= highest)) | (field.astype(kind) != field)
     if wrong.any():
-        raise InputError(f"{name} holds {field[wrong][0]:g}; allowed is 0 to {highest:g}")
-    return field
+        allowed = "true and false" if kind is np.bool_ else f"0 to {highest:g}"
+        raise InputError(f"{name} holds {field[wrong][0]:g}; allowed is {allowed}")
+    return field.astype(kind, copy=False)
 
 
 def _vectors(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
@@ -215,8 +260,10 @@ def _vectors(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     if vectors.shape not in {(3,), (3, *shape)}:
         raise InputError(f"{name} has the shape {vectors.shape}; allowed are (3,) and {(3, *shape)}")
     length = np.sqrt((vectors**2).sum(axis=0))
+    if np.isnan(length).all():
+        raise InputError(f"{name} is nan everywhere; allowed are unit vectors east, north, up")
     if np.any(np.abs(length - 1) > 1e-3):
         raise InputError(
-            f"{name} holds vectors of length {length.flat[np.abs(length - 1).argmax()]:.4g}; allowed is 1"
+            f"{name} holds vectors of length {length.flat[np.nanargmax(np.abs(length - 1))]:.4g}; allowed is 1"
         )
     return vectors.reshape(3, 1, 1) if vectors.ndim == 1 else vectors

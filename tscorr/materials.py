@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import resources
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,12 @@ class Material:
     """where the material was read from; for messages"""
 
     def __post_init__(self) -> None:
+        for name in (*PARAMETERS, "wavelength_um"):
+            value = getattr(self, name)
+            if isinstance(value, Real):
+                object.__setattr__(self, name, (float(value),))
+            elif not _is_list(list(value)):
+                raise MaterialError(f"material {self._label}: {name} = {value!r}; allowed are numbers")
         check = _Check(self)
         check.wavelengths()
         for name in PARAMETERS:
@@ -146,6 +153,8 @@ def builtin_materials() -> dict[str, Material]:
 
 def find(name: str, library: Mapping[str, Material]) -> Material:
     """The material of that name, or MaterialError naming the nearest one."""
+    if not isinstance(name, str):
+        raise MaterialError(f"a material is asked for as {name!r}; allowed is the name of one, a text")
     if name not in library:
         known = ", ".join(sorted(library))
         raise MaterialError(f"no material '{name}'{nearest(name, library)}; the libraries hold {known}")
@@ -196,7 +205,7 @@ def _numbers(value: Any, where: str) -> tuple[float, ...]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _is_list(value: Any) -> bool:

@@ -28,7 +28,7 @@ class SceneOutcome:
     state: str
     folder: Path
     error: str = ""
-    packed_report: bytes = b""
+    packed_report: bytes = field(default=b"", repr=False)
     """report.json, compressed: a batch holds those of all its scenes"""
 
     @classmethod

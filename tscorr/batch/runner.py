@@ -29,6 +29,7 @@ def run(
     """Correct the scenes of a configuration.
 
     settings  : a configuration, or the path of one.
+    scenes, materials : names of those to do, or one name; all if empty.
     scheduler : address of a Dask scheduler, in place of that of the configuration.
     overwrite : recompute scenes whose published result is current.
     progress  : given a scene that starts, a function that is told of pixels done; several threads call both.
@@ -42,9 +43,10 @@ def run(
     if not isinstance(settings, config.Config):
         settings = config.load_config(settings)
     given = {key: value for key, value in (("workers", workers), ("scheduler", scheduler)) if value is not None}
-    settings = settings.model_copy(update={"run": settings.run.model_copy(update=given)})
+    settings = config.with_run_settings(settings, given)
     memory.share()
-    planned = plan(settings, scenes, materials, to_run=True, overwrite=overwrite)
+    only_scenes, only_materials = ([names] if isinstance(names, str) else names for names in (scenes, materials))
+    planned = plan(settings, only_scenes, only_materials, to_run=True, overwrite=overwrite)
     folder = Path(settings.output.directory)
     with locked(folder), _log_file(folder):
         for deed in publish.recover(folder):

@@ -1,6 +1,6 @@
 """The configuration: a TOML file as pydantic models, checked before any work starts."""
 
-from tscorr.config.loading import absolute, load_config, paths_of
+from tscorr.config.loading import absolute, load_config, paths_of, with_run_settings
 from tscorr.config.scenes import (
     AnglesViewSettings,
     ConstantViewSettings,
@@ -43,4 +43,5 @@ __all__ = [
     "load_config",
     "paths_of",
     "template",
+    "with_run_settings",
 ]

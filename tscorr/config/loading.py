@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from tscorr.config.scenes import SURFACES, VIEWS, Scene
-from tscorr.config.sections import TABLES, Config
+from tscorr.config.sections import TABLES, Config, Run
 from tscorr.config.template import FILL_IN
 from tscorr.errors import ConfigError, nearest
 from tscorr.texts import read_text
@@ -22,6 +22,8 @@ def load_config(path: str | Path) -> Config:
 
     Raises ConfigError listing every problem, each with its place in the file, its value and what is allowed.
     """
+    if not isinstance(path, str | Path):
+        raise ConfigError(f"a configuration is asked for as {path!r}; allowed is the path of a file")
     path = Path(path)
     try:
         data = tomllib.loads(read_text(path, "configuration", ConfigError))
@@ -43,6 +45,16 @@ def load_config(path: str | Path) -> Config:
             ),
         }
     )
+
+
+def with_run_settings(settings: Config, given: Mapping[str, Any]) -> Config:
+    """The configuration with some keys of [run] changed; ConfigError where they cannot be."""
+    try:
+        run = Run.model_validate({**settings.run.model_dump(), **given})
+    except ValidationError as error:
+        problems = (_problem(Path("run"), item, {}) for item in error.errors())
+        raise ConfigError("\n".join(problems)) from None
+    return settings.model_copy(update={"run": run})
 
 
 def _expanded(scene: Scene, folder: Path, config: Path) -> Iterator[Scene]:

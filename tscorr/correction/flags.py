@@ -3,7 +3,10 @@
 from enum import IntEnum, IntFlag
 from typing import Any
 
-from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tscorr.errors import InputError
 
 Array = NDArray[Any]
 
@@ -44,10 +47,13 @@ class SpecularState(IntEnum):
     NOT_ASSESSED = 3
 
 
-def specular_state(flags: Array) -> Array:
+def specular_state(flags: ArrayLike) -> Array:
     """The `SpecularState` of each pixel of a flag layer.
 
     >>> specular_state(np.array([0, 64, 128 | PixelFlag.SATURATED, 194]))
     array([0, 1, 2, 3])
     """
-    return (flags >> SPECULAR_STATE_SHIFT) & 3
+    values = np.asarray(flags)
+    if values.dtype.kind not in "iu":
+        raise InputError(f"flags are {values.dtype}; allowed are integers")
+    return (values >> SPECULAR_STATE_SHIFT) & 3

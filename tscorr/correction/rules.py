@@ -77,9 +77,11 @@ class Rules:
                 object.__setattr__(self, name, (getattr(self, name),))
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         for field in fields(self):
-            choices = get_args(field.type) if get_origin(field.type) is Literal else ()
+            choices = (True, False) if field.type is bool else ()
+            choices = get_args(field.type) if get_origin(field.type) is Literal else choices
             if choices and values[field.name] not in choices:
-                allowed = f"{', '.join(map(repr, choices))}{nearest(str(values[field.name]), choices)}"
+                words = map(str, choices)
+                allowed = f"{', '.join(map(repr, choices))}{nearest(str(values[field.name]), words)}"
                 raise ConfigError(f"{field.name} = {values[field.name]!r}; allowed are {allowed}")
         check_values(values, LIMITS, ConfigError)
         object.__setattr__(self, "reference", ReferenceDirections(*self.reference))

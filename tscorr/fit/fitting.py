@@ -94,7 +94,7 @@ def fit_brdf(
         relative_azimuth_deg,
         f_r,
         sigma,
-        wavelength_um=wavelength_um,
+        wavelength_um=np.atleast_1d(wavelength_um),
         source=name,
     )
     settings = FitSettings(k=k, form=form, shared=shared, selection=selection or Selection(), bootstrap=bootstrap)

@@ -59,7 +59,7 @@ def lobe_shape(m: Lobe, wavelength_um: float | None = None) -> LobeShape:
     """
     if isinstance(m, LobeShape):
         return m
-    if isinstance(m, str):
+    if not isinstance(m, Material):
         m = material(m)
     own = m.wavelength_um
     if wavelength_um is None and own:
