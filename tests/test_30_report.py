@@ -320,7 +320,7 @@ def test_a_scene_without_anything(scene):
     assert report["pixels"]["no_material"] == report["pixels"]["total"] == 12
     assert report["heading"] == []
     assert report["mpixel_per_s"] is None
-    assert "Hardly any glare" in page(report, facts)
+    assert "Nothing was assessed in this scene" in page(report, facts)
 
 
 def test_a_material_that_is_not_in_the_scene(scene):

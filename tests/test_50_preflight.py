@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 from small_scene import (
     BANDS,
+    CELL,
     SHAPE,
     TILE,
+    WEST,
+    read_raster,
     small_scene,
     write_config,
     write_image,
@@ -101,7 +104,7 @@ def test_a_disk_that_is_too_small_is_told_with_the_estimate(tmp_path, monkeypatc
     ("values", "keys", "told"),
     [
         (np.full((BANDS, *SHAPE), 3000, np.uint16), {}, True),
-        (np.full((BANDS, *SHAPE), 3000, np.uint16), {"scale": 1.0}, False),
+        (np.full((BANDS, *SHAPE), 1, np.uint16), {"scale": 1.0}, False),
         (np.full((BANDS, *SHAPE), 3000, np.uint16), {"scale": 1e-4}, False),
         (np.full((BANDS, *SHAPE), 0.3, np.float32), {}, False),
     ],
@@ -112,6 +115,51 @@ def test_whole_numbers_without_a_scale_are_doubted(tmp_path, caplog, values, key
     batch.plan(load_config(write_config(tmp_path, {"name": "a", **keys}, {"name": "b", **keys})))
     wanted = f"the image {tmp_path}/image.tif, like 1 more, holds {values.dtype} values and no scale"
     assert (wanted in caplog.text) == told == (caplog.text != "")
+
+
+@pytest.mark.parametrize(
+    ("values", "keys", "middle"),
+    [
+        (np.full((BANDS, *SHAPE), 37.0, np.float32), {}, "37"),
+        (np.full((BANDS, *SHAPE), 3000, np.int16), {"scale": 0.01}, "30"),
+        (np.full((BANDS, *SHAPE), 0.5, np.float32), {"quantity": "brdf"}, "1.57"),
+        (np.full((BANDS, *SHAPE), 1.4, np.float32), {}, None),
+        (np.full((BANDS, *SHAPE), np.nan, np.float32), {}, None),
+    ],
+)
+def test_an_image_brighter_than_white_is_doubted(tmp_path, caplog, values, keys, middle):
+    write_inputs(tmp_path)
+    write_raster(tmp_path / "image.tif", values)
+    batch.plan(load_config(write_config(tmp_path, {"name": "a", **keys}, {"name": "b", **keys})))
+    told = "" if middle is None else f"the image {tmp_path}/image.tif shows reflectance factors about {middle}, and 1"
+    assert caplog.text.count(told or "reflectance factors") == (middle is not None)
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("dsm", "the rest is taken to be level, and flagged NORMAL_UNRELIABLE"),
+        ("class_map", "the rest has no material"),
+    ],
+)
+def test_what_covers_a_part_of_the_image_is_told_with_the_part(tmp_path, caplog, name, told):
+    config = small_scene(tmp_path)
+    path = tmp_path / f"{name}.tif"
+    write_raster(path, read_raster(path)[:, :, SHAPE[1] // 2 :], west=WEST + SHAPE[1] // 2 * CELL)
+    batch.plan(load_config(config))
+    assert f"{path} covers 50 % of the image {tmp_path}/image.tif: {told}" in caplog.text
+
+
+def test_normals_without_heights_are_told_to_show_no_shadows(tmp_path, caplog):
+    small_scene(tmp_path)
+    write_raster(tmp_path / "normals.tif", np.stack([np.zeros(SHAPE), np.zeros(SHAPE), np.ones(SHAPE)]).astype("f4"))
+    surface = {"kind": "normals", "path": "normals.tif"}
+    batch.plan(load_config(write_config(tmp_path, {"surface": surface | {"heights": "dsm.tif"}})))
+    assert caplog.text == ""
+    batch.plan(load_config(write_config(tmp_path, {"surface": surface, "shadows": False})))
+    assert caplog.text == ""
+    batch.plan(load_config(write_config(tmp_path, {"surface": surface})))
+    assert "scene 'roofs': normals without heights show no cast shadows" in caplog.text
 
 
 def test_what_is_done_and_what_is_replaced_needs_no_disk(tmp_path, monkeypatch):

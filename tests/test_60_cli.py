@@ -590,6 +590,16 @@ def test_the_version_is_that_of_the_package_and_is_stamped_into_the_outputs(tmp_
         assert file.tags()["TSCORR_VERSION"] == __version__
 
 
+def test_plan_shows_where_the_glare_is_and_what_lies_beyond_the_class_map(tmp_path):
+    """The sensor stands opposite to the sun, as SCENE has it: at 180."""
+    config = small_scene(tmp_path)
+    write_raster(tmp_path / "class_map.tif", class_map()[:, : SHAPE[1] // 2])
+    result = tscorr("plan", config)
+    assert "  relative azimuth 180 to 180, median 180 degrees; the glare is at 180\n" in result.stdout
+    assert "  surface dsm, cast shadows are looked for\n" in result.stdout
+    assert "(outside the class map: 50.0 %, " in result.stdout
+
+
 def test_all_missing_files_of_a_scene_are_told_at_once(tmp_path):
     config = small_scene(
         tmp_path, {"class_confidence": "sure.tif", "view": {"kind": "line", "trajectory": "line.csv"}}

@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ import tscorr
 from tscorr.cli import cli
 from tscorr.config import Config, load_config
 from tscorr.correction import SINGLE_FLAGS
+from tscorr.materials import Material, load_materials
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -129,3 +131,14 @@ def test_files_that_the_readme_points_at_exist():
     for path in re.findall(r"\]\(([^)#:]+)\)", README):
         assert (ROOT / path).exists(), path
     assert len(README.splitlines()) < 300
+
+
+def test_the_file_of_materials_that_the_page_shows_is_one(tmp_path):
+    page = (ROOT / "docs/materials.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```toml\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    (shown,) = load_materials(path).values()
+    assert shown.wavelength_um == (0.45, 0.55, 0.65)
+    keys = {field.name for field in fields(Material)} - {"name", "file"}
+    assert all(re.search(rf"^(# )?{key} = ", text, flags=re.MULTILINE) for key in keys)

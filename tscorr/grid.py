@@ -169,7 +169,8 @@ def point_scales(grid: Grid) -> tuple[float, float]:
     bent = 1 - ECCENTRICITY2 * np.sin(phi) ** 2
     north = np.deg2rad(latitude[1:] - latitude[0]) * SEMI_MAJOR_M * (1 - ECCENTRICITY2) / bent**1.5
     east = np.deg2rad(longitude[1:] - longitude[0]) * SEMI_MAJOR_M * np.cos(phi) / np.sqrt(bent)
-    along_x, along_y = step / np.hypot(east, north)
+    with np.errstate(divide="ignore"):  # of a CRS in which both points are one
+        along_x, along_y = step / np.hypot(east, north)
     return float(along_x), float(along_y)
 
 

@@ -121,7 +121,7 @@ class BandParameters:
 
 
 def load_materials(path: str | Path) -> dict[str, Material]:
-    """Materials of a TOML file, by name; the format is drawn in the README.
+    """Materials of a TOML file, by name; docs/materials.md shows the format.
 
     Raises MaterialError where the file is missing, is not TOML, or holds a material that cannot be.
 

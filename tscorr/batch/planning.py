@@ -1,16 +1,14 @@
 """All scenes checked before work on any of them starts."""
 
-import logging
 from collections.abc import Sequence
 from functools import cache
 
 from tscorr import config, rasters
+from tscorr.batch.doubts import warn
 from tscorr.batch.preflight import preflight
 from tscorr.errors import ConfigError, InputError, TscorrError, nearest
 from tscorr.materials import Material, builtin_materials, find, load_materials
 from tscorr.scene.plan import Scene, plan_scene
-
-log = logging.getLogger("tscorr")
 
 
 def library_of(settings: config.Config) -> dict[str, Material]:
@@ -67,23 +65,5 @@ def plan(
     if problems:
         kind = type(problems[0]) if len({type(problem) for problem in problems}) == 1 else InputError
         raise kind("\n".join(map(str, problems)))
-    _warn_of_missing_scales(planned)
+    warn(planned)
     return planned
-
-
-def _warn_of_missing_scales(planned: Sequence[Scene]) -> None:
-    """Of whole numbers without a scale, as many images hold them, next to nothing would be removed."""
-    doubtful = [
-        scene.image
-        for scene in planned
-        if scene.image.dtype.kind in "iu" and scene.settings.scale is None and set(scene.image.scales) == {1.0}
-    ]
-    if doubtful:
-        log.warning(
-            "the image %s%s holds %s values and no scale, so that the least above 0 is 1: give scale = ..., %s "
-            "stands for 1, or scale = 1.0 where that is right",
-            doubtful[0].path,
-            f", like {len(doubtful) - 1} more," if len(doubtful) > 1 else "",
-            doubtful[0].dtype,
-            "0.004 where 250" if doubtful[0].dtype.itemsize == 1 else "0.0001 where 10000",
-        )

@@ -153,6 +153,10 @@ def plan(config: Path, as_json: bool) -> None:
         click.echo(f"  sun zenith {entry['sun']['zenith_deg']:.2f}, azimuth {entry['sun']['azimuth_deg']:.2f} degrees")
         low, middle, high = entry["view_zenith_deg"] or (float("nan"),) * 3
         click.echo(f"  view zenith {low:.1f} to {high:.1f}, median {middle:.1f} degrees")
+        low, middle, high = entry["relative_azimuth_deg"] or (float("nan"),) * 3
+        click.echo(f"  relative azimuth {low:.0f} to {high:.0f}, median {middle:.0f} degrees; the glare is at 180")
+        shadows = "cast shadows are looked for" if entry["shadows"] else "no cast shadows"
+        click.echo(f"  surface {entry['surface']}, {shadows}")
         for name, share in entry["materials"].items():
             click.echo(f"  {name}: {100 * share:.1f} % of the pixels")
         if entry["bad_bands"]:
@@ -177,7 +181,8 @@ MOST_CLASSES = 6
 def _listed(entry: dict[str, Any]) -> str:
     """The most frequent classes that have no material, as the end of a line."""
     shares = list(entry["classes_without_material"].items())
-    listed = [f"class {value}: {100 * share:.1f} %" for value, share in shares[:MOST_CLASSES]]
+    names = [f"class {name}" if name.lstrip("-").isdigit() else name for name, _ in shares]
+    listed = [f"{name}: {100 * share:.1f} %" for name, (_, share) in zip(names, shares, strict=True)][:MOST_CLASSES]
     more = [f"{len(shares) - MOST_CLASSES} more"] if len(shares) > MOST_CLASSES else []
     return f" ({', '.join(listed + more)})" if listed else ""
 

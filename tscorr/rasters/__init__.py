@@ -13,13 +13,14 @@ from tscorr.rasters.header import (
     check_metric,
     check_overlap,
     check_true_lengths,
+    covered_share,
     describe,
     environment,
     opened,
 )
 from tscorr.rasters.joining import join_rows, result
 from tscorr.rasters.kept import KeptReader
-from tscorr.rasters.reading import Reader, read_samples
+from tscorr.rasters.reading import Reader, middle_value, read_samples
 from tscorr.rasters.stored_tiles import StoredTiles
 from tscorr.rasters.writing import Layer, Writer, make_cog, unwatched
 
@@ -39,12 +40,14 @@ __all__ = [
     "check_metric",
     "check_overlap",
     "check_true_lengths",
+    "covered_share",
     "decimated",
     "describe",
     "environment",
     "expressible",
     "join_rows",
     "make_cog",
+    "middle_value",
     "opened",
     "read_decimated",
     "read_decimated_flags",

@@ -273,8 +273,7 @@ def check_overlap(raster: RasterInfo, image: RasterInfo, what: str) -> None:
     if raster.grid.crs is None:
         raise InputError(f"{what} {raster.path} has no CRS; it must say where it is")
     try:
-        with rasterio.Env():
-            west, south, east, north = transform_bounds(raster.grid.crs, image.grid.crs, *_bounds(raster.grid))
+        west, south, east, north = _bounds_over(raster.grid, image.grid)
     except Exception as error:  # noqa: BLE001 - rasterio raises PROJ's errors unwrapped
         raise InputError(
             f"{what} {raster.path} is in a CRS that cannot be turned into that of the image {image.path}: "
@@ -282,10 +281,30 @@ def check_overlap(raster: RasterInfo, image: RasterInfo, what: str) -> None:
         ) from None
     left, bottom, right, top = _bounds(image.grid)
     if not (west < right and east > left and south < top and north > bottom):
+        digits = 4 if image.grid.crs.is_geographic else 0
         raise InputError(
-            f"{what} {raster.path} covers x {west:.0f} to {east:.0f}, y {south:.0f} to {north:.0f}; it does not "
-            f"overlap the image {image.path}, x {left:.0f} to {right:.0f}, y {bottom:.0f} to {top:.0f}"
+            f"{what} {raster.path} covers x {west:.{digits}f} to {east:.{digits}f}, y {south:.{digits}f} to "
+            f"{north:.{digits}f}; it does not overlap the image {image.path}, x {left:.{digits}f} to "
+            f"{right:.{digits}f}, y {bottom:.{digits}f} to {top:.{digits}f}"
         )
+
+
+def covered_share(raster: RasterInfo, image: RasterInfo) -> float:
+    """Which part of the image's extent lies within that of a raster that passed `check_overlap`."""
+    if raster.grid == image.grid or raster.grid.crs is None:
+        return 1.0
+    west, south, east, north = _bounds_over(raster.grid, image.grid)
+    left, bottom, right, top = _bounds(image.grid)
+    width, height = min(east, right) - max(west, left), min(north, top) - max(south, bottom)
+    area = (right - left) * (top - bottom)
+    return max(width, 0.0) * max(height, 0.0) / area if area > 0 else 1.0
+
+
+def _bounds_over(grid: Grid, image: Grid) -> tuple[float, float, float, float]:
+    """West, south, east and north of a grid in the CRS of the image's."""
+    with rasterio.Env():
+        west, south, east, north = transform_bounds(grid.crs, image.crs, *_bounds(grid))
+    return west, south, east, north
 
 
 def check_metric(raster: RasterInfo, what: str) -> None:

@@ -11,7 +11,7 @@ from rasterio.vrt import WarpedVRT
 
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
-from tscorr.rasters.header import RasterInfo, environment, reason_of
+from tscorr.rasters.header import RasterInfo, environment, opened, reason_of
 from tscorr.rasters.sound import GDAL_ERRORS, open_dataset
 
 Array = NDArray[Any]
@@ -41,7 +41,7 @@ class Reader:
         self.info = info
         self._grid = grid or info.grid
         self._resampling = resampling
-        self._fill = fill
+        self.fill = fill
         self._margin = margin
         shift = _pixel_shift(info.grid, self._grid)
         self._aligned = shift is not None
@@ -74,11 +74,11 @@ class Reader:
             values = self._pixels(dataset, inside, bands)
         else:
             leading = () if isinstance(bands, int) else (self.info.bands if bands is None else len(bands),)
-            values = np.full((*leading, *block.shape), self._fill, self._out_type())
+            values = np.full((*leading, *block.shape), self.fill, self._out_type())
             if inside.height > 0 and inside.width > 0:
                 rows, cols = slice(top - row, bottom - row), slice(left - col, right - col)
                 values[..., rows, cols] = self._pixels(dataset, inside, bands)
-        if np.isnan(self._fill):
+        if np.isnan(self.fill):
             values = values.astype(np.float32, copy=False)
             values[~np.isfinite(values)] = np.nan
             if self.info.nodata is not None:
@@ -94,7 +94,7 @@ class Reader:
         return values if bands is None else values[np.array(bands) - 1]
 
     def _out_type(self) -> np.dtype[Any]:
-        return np.dtype(np.float32) if np.isnan(self._fill) else self.info.dtype
+        return np.dtype(np.float32) if np.isnan(self.fill) else self.info.dtype
 
     def _dataset(self) -> Any:
         """The handle of the calling thread."""
@@ -110,7 +110,7 @@ class Reader:
     def _warped(self, source: Any) -> Any:
         rows, cols = self._grid.shape
         grid = self._grid.crop(Block(0, 0, rows, cols).padded(self._margin))
-        nodata = self.info.nodata if self.info.nodata is not None else self._fill
+        nodata = self.info.nodata if self.info.nodata is not None else self.fill
         # Where its cells are slightly smaller than those of the grid, GDAL widens its bilinear kernel by as
         # little, and unevenly: heights then err by a tenth of a cell times the slope.
         similar = min(self.info.grid.cell_size) > 0.5 * max(grid.cell_size)
@@ -174,6 +174,16 @@ def read_samples(info: RasterInfo, most: int, side: int) -> Array:
         windows = [Block(row, col, height, width) for row, height in axes[0] for col, width in axes[1]]
         values = np.concatenate([reader.read(window, 1).ravel() for window in windows])
     return values[np.isfinite(values)]
+
+
+def middle_value(info: RasterInfo, side: int, nodata: float | None) -> float:
+    """Median of band 1 over side x side pixels in the middle of a raster, without `nodata`; nan of none."""
+    rows, cols = info.shape
+    part = Block(max(0, (rows - side) // 2), max(0, (cols - side) // 2), min(side, rows), min(side, cols))
+    with opened(info.path, ours=info.ours) as dataset:
+        values = dataset.read(1, window=part.window)
+    values = values[np.isfinite(values) & (values != nodata)]
+    return float(np.median(values)) if values.size else float("nan")
 
 
 def _in_tile(first: int, side: int, tile: int) -> int:

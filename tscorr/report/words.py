@@ -70,6 +70,8 @@ def by_glare(report: Report) -> list[str]:
 
 def headline(report: Report) -> str:
     """The first line of the page: how much glare, on what."""
+    if report["pixels"]["evaluated"] == 0:
+        return "Nothing was assessed in this scene"
     touched = [
         f"{percent(glare_fraction(report['materials'][name]))} of {readable(name)}"
         for name in by_glare(report)

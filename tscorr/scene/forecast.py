@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tscorr import rasters
+from tscorr.angles import relative_azimuth
 from tscorr.correction import Corrector, class_rows
 from tscorr.scene.correct import is_current, view_samples
 from tscorr.scene.cutting import memory_mb, pixel_bytes, units_of
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 PRODUCT_BYTES = {"flags": 2, "azimuthal_width": 4, "angles": 36}
+OUTSIDE = "outside the class map"
 OVERVIEWS = 4 / 3
 """size of a raster with its overviews, over that without"""
 BESIDE_BYTES = 3e6
@@ -36,6 +39,7 @@ def forecast(scene: Scene) -> dict[str, Any]:
     present: dict[Block, list[int]] = {}
     unknown: Counter[int] = Counter()
     with scene.classes() as classes:
+        outside = classes.fill if rasters.covered_share(scene.class_map, scene.image) < 1 else None
         for block in cut:
             values = classes.read(block, 1)
             material = class_rows(values, scene.rows)
@@ -45,8 +49,9 @@ def forecast(scene: Scene) -> dict[str, Any]:
             present[block] = [int(row) for row in np.flatnonzero(in_block * peaks)]
     rows, cols = scene.image.shape
     total = rows * cols
-    zenith, _ = view_samples(scene)
-    zenith = zenith[np.isfinite(zenith)]
+    zenith, azimuth = view_samples(scene)
+    seen = np.isfinite(zenith)
+    relative = relative_azimuth(scene.sun.azimuth_deg, azimuth[seen])
     return {
         "scene": scene.name,
         "image": scene.image.path.name,
@@ -55,12 +60,17 @@ def forecast(scene: Scene) -> dict[str, Any]:
         "bands": scene.image.bands,
         "bad_bands": scene.bad_names,
         "sun": {"zenith_deg": scene.sun.zenith_deg, "azimuth_deg": scene.sun.azimuth_deg},
-        "view_zenith_deg": [float(np.quantile(zenith, q)) for q in (0, 0.5, 1)] if zenith.size else None,
+        "view_zenith_deg": _spread(zenith[seen]),
+        "relative_azimuth_deg": _spread(relative),
+        "surface": scene.settings.surface.kind,
+        "shadows": scene.settings.shadows and scene.heights_file is not None,
         "materials": {
             surface.name: float(counts[row] / total) for row, (surface, _, _) in enumerate(scene.materials, start=1)
         },
         "no_material": float(counts[0] / total),
-        "classes_without_material": {str(value): count / total for value, count in unknown.most_common()},
+        "classes_without_material": {
+            OUTSIDE if value == outside else str(value): count / total for value, count in unknown.most_common()
+        },
         "blocks": len(cut),
         "blocks_no_specular_material": sum(not rows for rows in present.values()),
         "negligible": by_threshold(scene, present),
@@ -68,6 +78,11 @@ def forecast(scene: Scene) -> dict[str, Any]:
         "memory_mb": memory_mb(scene),
         "current": is_current(scene),
     }
+
+
+def _spread(angles_deg: Array) -> list[float] | None:
+    """Least, middle and largest; None of none."""
+    return [float(np.quantile(angles_deg, q)) for q in (0, 0.5, 1)] if angles_deg.size else None
 
 
 def _counted(values: Array) -> dict[int, int]:

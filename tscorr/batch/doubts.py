@@ -1,0 +1,83 @@
+"""What can be and is hardly meant: warnings before work starts."""
+
+import logging
+from collections.abc import Sequence
+
+from tscorr import config, rasters
+from tscorr.errors import TscorrError
+from tscorr.scene.plan import Scene
+
+log = logging.getLogger("tscorr")
+
+TOO_BRIGHT = 1.5
+"""a reflectance factor that half of an image does not exceed, whatever it shows"""
+COVERED = 0.98
+SAMPLE_PX = 256
+"""side of what is looked at in the middle of an image"""
+
+
+def warn(planned: Sequence[Scene]) -> None:
+    """Say what is doubtful about scenes."""
+    _of_missing_scales(planned)
+    for scene in {(scene.image.dtype, scene.stored.scale, scene.stored.offset): scene for scene in planned}.values():
+        _of_brightness(scene)  # one image of each kind: what is wrong with it mostly is with all
+    for scene in planned:
+        _of_coverage(scene)
+        surface = scene.settings.surface
+        if scene.settings.shadows and isinstance(surface, config.NormalsSettings) and surface.heights is None:
+            log.warning("scene '%s': normals without heights show no cast shadows: give heights = ...", scene.name)
+
+
+def _of_missing_scales(planned: Sequence[Scene]) -> None:
+    """Of whole numbers without a scale, as many images hold them, next to nothing would be removed."""
+    doubtful = [
+        scene.image
+        for scene in planned
+        if scene.image.dtype.kind in "iu" and scene.settings.scale is None and set(scene.image.scales) == {1.0}
+    ]
+    if doubtful:
+        log.warning(
+            "the image %s%s holds %s values and no scale, so that the least above 0 is 1: give scale = ..., %s "
+            "stands for 1, or scale = 1.0 where that is right",
+            doubtful[0].path,
+            f", like {len(doubtful) - 1} more," if len(doubtful) > 1 else "",
+            doubtful[0].dtype,
+            "0.004 where 250" if doubtful[0].dtype.itemsize == 1 else "0.0001 where 10000",
+        )
+
+
+def _of_brightness(scene: Scene) -> None:
+    """Per cent, radiances or counts in place of reflectance factors."""
+    image, stored = scene.image, scene.stored
+    unscaled = image.dtype.kind in "iu" and scene.settings.scale is None and set(image.scales) == {1.0}
+    if unscaled or (image.bad_bands and image.bad_bands[0]) or scene.config.output.corrected == "vrt":
+        return  # told already, or nothing to look at; and for a VRT the image is read only where it must be
+    try:
+        middle = rasters.middle_value(image, SAMPLE_PX, stored.nodata) * stored.scale[0] + stored.offset[0]
+    except (TscorrError, OSError):  # its scene will tell
+        return
+    if middle > TOO_BRIGHT:
+        log.warning(
+            "the image %s shows reflectance factors about %.3g, and 1 is white: if these are per cent or counts, give "
+            "scale = ...; radiances have to be made reflectances first",
+            image.path,
+            middle,
+        )
+
+
+def _of_coverage(scene: Scene) -> None:
+    """A surface model or a class map of a part of the image."""
+    for raster, name, rest in (
+        (scene.heights_file, "surface model", "is taken to be level, and flagged NORMAL_UNRELIABLE"),
+        (scene.class_map, "class map", "has no material"),
+    ):
+        share = 1.0 if raster is None else rasters.covered_share(raster, scene.image)
+        if raster is not None and share < COVERED:
+            log.warning(
+                "the %s %s covers %.0f %% of the image %s: the rest %s",
+                name,
+                raster.path,
+                100 * share,
+                scene.image.path,
+                rest,
+            )
