@@ -16,7 +16,7 @@ from tscorr.api import correct
 from tscorr.correction import BlockInputs, Corrector, PixelFlag, ReferenceDirections, Rules, SpecularState, Stored
 from tscorr.correction.albedo import specular_albedo
 from tscorr.correction.covariance import ORIGINS, covariances, origin, paper_directions, synthetic_covariance
-from tscorr.correction.flags import SPECULAR_STATE_SHIFT
+from tscorr.correction.flags import SPECULAR_STATE_SHIFT, specular_state
 from tscorr.correction.sigmas import SigmaTally
 from tscorr.correction.sky import SKY_ERROR, sky_polynomial
 from tscorr.materials import PARAMETERS, Material, builtin_materials, material
@@ -401,3 +401,47 @@ def test_skipping_changes_no_value_and_no_sigma(settings):
     skip, all_ = (correct(image, classes, surfaces, sun, view, normal, skip=skip, **options) for skip in (True, False))
     for name in ("corrected", "removed", "flags", "sigma"):
         assert getattr(skip, name).tobytes() == getattr(all_, name).tobytes(), name
+
+
+# The direct fraction
+
+
+@pytest.mark.parametrize("precision", ["reference", "exact", "fast"])
+@pytest.mark.parametrize("irradiance_plane", ["horizontal", "facet"])
+@pytest.mark.parametrize("method", ["subtract", "ratio", "reference"])
+@pytest.mark.parametrize("sky_specular", [False, True])
+def test_the_direct_fraction_moves_the_result_as_a_difference_of_two_results_says(
+    precision, irradiance_plane, method, sky_specular
+):
+    """On facets of up to 30 degrees, where the diffuse part of "ratio" changes with it, too; no other error."""
+    known = replace(material("red_concrete"), sigma={}, covariance=())
+    tilts, azimuths = np.meshgrid([0.0, 10.0, 20.0, 30.0], [0.0, 60.0, 120.0, 180.0])
+    normal = unit_vector(tilts, azimuths)
+    sun, view = unit_vector(45.0, 180.0), unit_vector(40.0, 5.0)
+    image, classes, beta_sigma, step = (
+        np.full((1, *tilts.shape), 2.0, np.float32),
+        np.ones(tilts.shape, int),
+        0.05,
+        0.02,
+    )
+
+    def corrected(beta, precision="reference"):
+        rules = Rules(
+            precision=precision,
+            method=method,
+            irradiance_plane=irradiance_plane,
+            sky_specular=sky_specular,
+            direct_fraction=beta,
+            direct_fraction_sigma=beta_sigma,
+            uncorrectable_share=1.0,
+            max_zenith_deg=85.0,
+        )
+        return correct(image, classes, {1: known}, sun, view, normal, rules=rules, uncertainty=True)
+
+    higher, lower = (corrected(0.8 + d).corrected[0].astype(float) for d in (step, -step))
+    result = corrected(0.8, precision)
+    done = specular_state(result.flags) == SpecularState.CORRECTED
+    assert done.sum() >= 8
+    np.testing.assert_allclose(
+        result.sigma[0][done], (abs(higher - lower) / (2 * step) * beta_sigma)[done], rtol=0.02, atol=2e-6
+    )

@@ -90,7 +90,7 @@ def _row(surface: Material, parameters: BandParameters, rules: Rules, bands: int
     gradients = np.stack([_log_gradient(angles, row, ratio=False) for row in by_band])
     variance, cross = _variance_rows(by_band, covariance, gradients, steepest, ratio=rules.method == "ratio")
     rate = beta_sigma / np.where(beta > 0, beta, 1)
-    apart = adds or has_sky  # then the direct fraction changes more than the lobe
+    apart = rules.method != "subtract" or has_sky  # then the direct fraction changes more than the lobe
     if not apart:
         variance[:, 0] += rate**2
     back_albedo = _albedo_at(sky, angles.cos_r) if adds else np.zeros(bands)
@@ -124,6 +124,7 @@ def _row(surface: Material, parameters: BandParameters, rules: Rules, bands: int
                 rate * apart,
                 beta_sigma * apart,
                 sky_sigma,
+                np.pi * parameters.t0 * beta_sigma,
             ],
             axis=1,
         ),

@@ -46,6 +46,8 @@ class _Light(NamedTuple):
     back: Array
     """the specular part at the reference geometry, that is added back"""
     diffuse: Array
+    """pi t0 (beta c + (1 - beta) v), v the part of the sky that the facet sees"""
+    diffuse_by_beta: Array
 
     @property
     def specular(self) -> Array:
@@ -163,15 +165,17 @@ def _light(pixels: _Pixels, table: Any, extras: Any) -> _Light:
     direct = np.where(pixels.lit, table.gain[q, :, None] * c * f_spec, 0)
     if extras is None:
         nothing = np.zeros_like(direct)
-        return _Light(direct, nothing, nothing, nothing)
+        return _Light(direct, nothing, nothing, nothing, nothing)
     beta, assessed = extras.beta[q, :, None], pixels.lit | pixels.shaded
     sky_view = (1 + pixels.up) / 2 if table.ways[q] & bits.LEVEL else 1.0
+    of_sun, of_t0 = np.where(pixels.lit, c, 0), np.pi * extras.t0[q, :, None]
     return _Light(
         direct=direct,
         sky=np.where(assessed, (1 - beta) * _sky_albedo(angles.cos_r, extras.sky[q]), 0),
         back=np.where(pixels.lit, extras.reference[q, :, None], 0)
         + np.where(assessed, (1 - beta) * extras.reference_sky[q, :, None], 0),
-        diffuse=np.pi * extras.t0[q, :, None] * (beta * np.where(pixels.lit, c, 0) + (1 - beta) * sky_view),
+        diffuse=of_t0 * (beta * of_sun + (1 - beta) * sky_view),
+        diffuse_by_beta=of_t0 * (of_sun - sky_view),
     )
 
 
@@ -250,6 +254,8 @@ def _sigma_removed(
     )
     albedo = _sky_albedo(angles.cos_r, extras.sky[q]) - back_albedo
     by_beta = (light.direct - back) / np.where(beta > 0, beta, 1) - albedo
+    if method == bits.RATIO:  # of B D / (B + D): the derivative of B, less B / D times that of D
+        by_beta = by_beta - light.specular * light.diffuse_by_beta / np.where(light.diffuse > 0, light.diffuse, 1)
     variance = (
         (np.sqrt(np.maximum(of_material, 0)) + of_sky) ** 2
         + np.where(pixels.lit, light.direct**2 * directions.at(w), 0)

@@ -22,6 +22,7 @@ from tscorr.kernels.layout import (
     COS_MIN,
     COS_R,
     DIFFUSE,
+    DIFFUSE_RATE,
     GRAZING,
     HALF,
     HIT,
@@ -161,7 +162,7 @@ def weigh_any(scratch, extras, peaks, line, rules, b):
 def set_parts(whole, real, aims, kind, sky, parts):
     """What one band of one material adds and shows besides the sun's lobe: sky, reference geometry, diffuse part."""
     of_sky, diffuse_sun, diffuse_sky, back, back_sky = parts[0], parts[1], parts[2], parts[3], parts[4]
-    rate, sigma, sky_sigma = parts[5], parts[6], parts[7]
+    rate, sigma, sky_sigma, diffuse_sigma = parts[5], parts[6], parts[7], parts[8]
     scale, shift = sky[SKY_DEGREE + 1], sky[SKY_DEGREE + 2]
     s0, s1, s2, s3, s4, s5, s6 = sky[0], sky[1], sky[2], sky[3], sky[4], sky[5], sky[6]
     s7, s8, s9, s10, s11, s12 = sky[7], sky[8], sky[9], sky[10], sky[11], sky[12]
@@ -173,12 +174,14 @@ def set_parts(whole, real, aims, kind, sky, parts):
         a = (((((a * x + s5) * x + s4) * x + s3) * x + s2) * x + s1) * x + s0
         plane = real[COS_I + j] / real[SUN_UP + j] if level else ONE
         sky_view = (ONE + real.dtype.type(aims[NORMAL + 2 * CHUNK + j])) * HALF if level else ONE
-        shown = diffuse_sun * (plane if lit else ZERO) + diffuse_sky * sky_view
+        plane = plane if lit else ZERO
+        shown = diffuse_sun * plane + diffuse_sky * sky_view
         real[SKY + j] = (of_sky * a if good else ZERO) if mine else real[SKY + j]
         real[ALBEDO + j] = a - back_sky if mine else real[ALBEDO + j]
         real[BACK + j] = (back if lit else ZERO) if mine else real[BACK + j]
         real[BACK_SKY + j] = (of_sky * back_sky if good else ZERO) if mine else real[BACK_SKY + j]
         real[DIFFUSE + j] = shown if mine else real[DIFFUSE + j]
+        real[DIFFUSE_RATE + j] = diffuse_sigma * (plane - sky_view) if mine else real[DIFFUSE_RATE + j]
         real[BETA_RATE + j] = rate if mine else real[BETA_RATE + j]
         real[BETA_SIGMA + j] = sigma if mine else real[BETA_SIGMA + j]
         real[SKY_SIGMA + j] = sky_sigma if mine else real[SKY_SIGMA + j]

@@ -20,6 +20,7 @@ from tscorr.kernels.layout import (
     COS_R,
     CROSS,
     DIFFUSE,
+    DIFFUSE_RATE,
     EXCESS,
     FOUR,
     HALF,
@@ -237,11 +238,12 @@ def _spread_parts(sigma, amounts, direct, line, scale, offset, saturation, whole
         error = np.sqrt(max(ZERO, of_material))
         error = error + abs(real[SKY + j] - real[BACK_SKY + j]) * real[SKY_SIGMA + j]
         of_beta = (sun - back) * real[BETA_RATE + j] - real[ALBEDO + j] * real[BETA_SIGMA + j]
+        is_ratio, diffuse = whole[METHOD + j] == RATIO, real[DIFFUSE + j]
+        of_beta -= specular_part * real[DIFFUSE_RATE + j] / (diffuse if diffuse > ZERO else ONE) if is_ratio else ZERO
         variance = error * error + sun * sun * (real[SPREAD + j] - real[OF_MATERIAL + j]) + of_beta * of_beta
-        total = specular_part + real[DIFFUSE + j]
+        total = specular_part + diffuse
         per_total = ONE / (total if total > ZERO else ONE)
-        is_ratio = whole[METHOD + j] == RATIO
-        change = real[WEIGHT + j] * (seen * real[DIFFUSE + j] * per_total * per_total if is_ratio else ONE)
+        change = real[WEIGHT + j] * (seen * diffuse * per_total * per_total if is_ratio else ONE)
         kept = ONE - real[WEIGHT + j] * specular_part * per_total if is_ratio else ONE
         variance = variance * change * change
         take = (a != ZERO) & (value < saturation)

@@ -165,7 +165,7 @@ class Extras(NamedTuple):
 
 def new_scratch(bands: int, real: type[np.floating[Any]]) -> Scratch:
     """Memory for one thread."""
-    whole, lines = np.zeros(17 * CHUNK, np.int32), np.zeros(39 * CHUNK, real)
+    whole, lines = np.zeros(17 * CHUNK, np.int32), np.zeros(40 * CHUNK, real)
     lines[FACTOR : FACTOR + CHUNK] = 1
     return Scratch(
         aims=np.zeros(9 * CHUNK),
