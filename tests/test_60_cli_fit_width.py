@@ -59,6 +59,14 @@ def test_fit_does_not_write_what_did_not_converge(measured, tmp_path, monkeypatc
     assert not (tmp_path / "m.toml").exists()
 
 
+def test_fit_reads_what_a_spreadsheet_writes(measured):
+    """Semicolons, and names of columns as one likes to write them."""
+    plain = run("fit", measured).stdout
+    head, rest = measured.read_text(encoding="utf-8").split("\n", 1)
+    measured.write_text(f"{head.title()}\n{rest}".replace(",", ";"), encoding="utf-8")
+    assert run("fit", measured).stdout == plain
+
+
 def test_fit_does_not_replace_other_materials(measured, tmp_path):
     library = tmp_path / "mine.toml"
     library.write_text("[other]\nt0 = 0.1\nt1 = 0.1\nw = 0.1\nn = 1.5\n")

@@ -140,7 +140,7 @@ def correct(
     native = image.dtype.newbyteorder("=")
     cube = np.array(image[None] if image.ndim == 2 else image, dtype=native, order="C")
     class_map = np.asarray(classes)
-    if cube.ndim != 3 or class_map.shape != cube.shape[1:] or cube.size == 0:
+    if cube.ndim != 3 or class_map.shape != cube.shape[1:] or cube.shape[0] == 0:
         raise InputError(f"an image of shape {image.shape} and classes of shape {class_map.shape} do not fit")
     numbers = {"scale": scale, "offset": offset, "nodata": nodata, "saturation": saturation}
     sigmas = {"image_noise": image_noise, "direction_sigma_deg": direction_sigma_deg}
@@ -260,7 +260,7 @@ def _vectors(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     if vectors.shape not in {(3,), (3, *shape)}:
         raise InputError(f"{name} has the shape {vectors.shape}; allowed are (3,) and {(3, *shape)}")
     length = np.sqrt((vectors**2).sum(axis=0))
-    if np.isnan(length).all():
+    if length.size and np.isnan(length).all():
         raise InputError(f"{name} is nan everywhere; allowed are unit vectors east, north, up")
     if np.any(np.abs(length - 1) > 1e-3):
         raise InputError(

@@ -66,14 +66,16 @@ def _read_csv(text: str, file: str) -> Measurements:
     ]
     if len(lines) < 2:
         raise InputError(f"{file} has {len(lines)} lines; allowed is a line of column names, then values")
-    columns = [_column(heading, file) for heading in next(csv.reader([lines[0][1]]))]
+    separator = ";" if ";" in lines[0][1] else ","
+    parts = [(number, next(csv.reader([line], delimiter=separator))) for number, line in lines]
+    columns = [_column(heading, file) for heading in parts[0][1]]
     quantity = _checked_columns(columns, file)
-    rows = [_numbers(next(csv.reader([line])), len(columns), f"{file} line {number}") for number, line in lines[1:]]
+    rows = [_numbers(cells, len(columns), f"{file} line {number}") for number, cells in parts[1:]]
     return _tabulated(columns, np.array(rows), quantity, file)
 
 
 def _column(heading: str, file: str) -> _Column:
-    match = HEADING.fullmatch(heading.strip())
+    match = HEADING.fullmatch(heading.strip().lower())
     name, unit = (match["name"], match["unit"] or "") if match else (heading, "")
     wavelength = WAVELENGTH_COLUMN.fullmatch(name)
     if wavelength:
