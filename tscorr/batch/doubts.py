@@ -30,11 +30,7 @@ def warn(planned: Sequence[Scene]) -> None:
 
 def _of_missing_scales(planned: Sequence[Scene]) -> None:
     """Of whole numbers without a scale, as many images hold them, next to nothing would be removed."""
-    doubtful = [
-        scene.image
-        for scene in planned
-        if scene.image.dtype.kind in "iu" and scene.settings.scale is None and set(scene.image.scales) == {1.0}
-    ]
+    doubtful = [scene.image for scene in planned if _lacks_scale(scene)]
     if doubtful:
         log.warning(
             "the image %s%s holds %s values and no scale, so that the least above 0 is 1: give scale = ..., %s "
@@ -46,12 +42,17 @@ def _of_missing_scales(planned: Sequence[Scene]) -> None:
         )
 
 
+def _lacks_scale(scene: Scene) -> bool:
+    """Whether nobody says what the whole numbers of the image stand for."""
+    return scene.image.dtype.kind in "iu" and scene.settings.scale is None and set(scene.image.scales) == {1.0}
+
+
 def _of_brightness(scene: Scene) -> None:
     """Per cent, radiances or counts in place of reflectance factors."""
     image, stored = scene.image, scene.stored
-    unscaled = image.dtype.kind in "iu" and scene.settings.scale is None and set(image.scales) == {1.0}
-    if unscaled or (image.bad_bands and image.bad_bands[0]) or scene.config.output.corrected == "vrt":
-        return  # told already, or nothing to look at; and for a VRT the image is read only where it must be
+    as_vrt = scene.config.output.corrected == "vrt"  # then the image is read only where it must be
+    if _lacks_scale(scene) or as_vrt or (image.bad_bands and image.bad_bands[0]):
+        return
     try:
         middle = rasters.middle_value(image, SAMPLE_PX, stored.nodata) * stored.scale[0] + stored.offset[0]
     except (TscorrError, OSError):  # its scene will tell

@@ -2,7 +2,6 @@
 
 import math
 import threading
-import warnings
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from functools import partial
@@ -261,11 +260,8 @@ class Ground:
         lowest, highest = np.inf, -np.inf
         for block in blocks((last - first, cols + 2 * beyond), (SAMPLE_PX * 2, SAMPLE_PX * 8)):
             heights = self._read_heights(Block(block.row + first, block.col - beyond, block.height, block.width))
-            with warnings.catch_warnings():
-                warnings.simplefilter(
-                    "ignore", RuntimeWarning
-                )  # nothing but voids: nan, which fmin and fmax leave out
-                lowest, highest = np.fmin(lowest, np.nanmin(heights)), np.fmax(highest, np.nanmax(heights))
+            known = heights[np.isfinite(heights)]
+            lowest, highest = known.min(initial=lowest), known.max(initial=highest)
         return float(max(highest - lowest, 0.0))
 
     def _reaches_beyond(self) -> bool:
