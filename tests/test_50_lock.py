@@ -107,6 +107,16 @@ def test_the_lock_is_let_go_whatever_happens(tmp_path, error):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_interruption_while_the_lock_is_signed_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(lock.os, "fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt), lock.locked(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_of_many_at_once_one_holds_the_folder_at_a_time(tmp_path):
     inside, most = [], []
 

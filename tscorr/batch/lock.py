@@ -47,12 +47,13 @@ def locked(folder: Path) -> Iterator[None]:
         raise ConfigError(f"[output] directory = {folder} cannot be written: {error.strerror}") from None
     ended = threading.Event()
     renewal = threading.Thread(target=_renew, args=(descriptor, ended), daemon=True)
-    renewal.start()
     try:
+        renewal.start()
         yield
     finally:
         ended.set()
-        renewal.join()
+        if renewal.ident is not None:  # it was started
+            renewal.join()
         with suppress(OSError):  # the folder may have become read-only; a file that nobody locks holds nobody up
             path.unlink()  # before the lock is let go: the next one then makes a file of its own
         os.close(descriptor)
@@ -61,15 +62,18 @@ def locked(folder: Path) -> Iterator[None]:
 def _hold(path: Path) -> int:
     """The open lock file, held and signed."""
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        descriptor, ours = os.open(path, os.O_RDWR | os.O_CREAT, 0o644), False
         try:
             _take(descriptor, path)
-            if _is(descriptor, path):
+            ours = _is(descriptor, path)
+            if ours:
                 os.ftruncate(descriptor, 0)
                 os.pwrite(descriptor, json.dumps(_myself()).encode(), 0)
                 os.fsync(descriptor)  # a cluster's workers read it over the network
                 return descriptor
         except BaseException:
+            if ours:  # interrupted while it was signed
+                path.unlink(missing_ok=True)
             os.close(descriptor)
             raise
         os.close(descriptor)  # its holder removed it while it was being opened
