@@ -200,6 +200,31 @@ def test_the_surface_is_read_only_where_a_specular_material_is(tmp_path):
     assert skipped["blocks_no_specular_material"] == 8
 
 
+@pytest.mark.parametrize(
+    ("roof", "parts"), [((20, 30), {(0, 0)}), ((511, 30), {(0, 0), (512, 0)}), ((20, 480), {(0, 0), (0, 512)})]
+)
+def test_only_heights_that_a_normal_needs_are_read(tmp_path, monkeypatch, roof, parts):
+    large_scene(tmp_path, roofs=[])
+    classes = read_raster(tmp_path / "class_map.tif")[0]
+    row, col = roof
+    classes[row : row + 1, col : col + 32] = METAL
+    write_raster(tmp_path / "class_map.tif", classes, blockxsize=256, blockysize=256)
+    read, places = Reader.read, set()
+
+    def recorded(self, block, bands=None):
+        if self.info.path.name == "dsm.tif":
+            places.add((block.row, block.col, block.height, block.width))
+        return read(self, block, bands)
+
+    monkeypatch.setattr(Reader, "read", recorded)
+    with_and_without(tmp_path, {"shadows": False})
+    unskipped = {(row, col) for row, col, *_ in places}
+    places.clear()
+    run(write_config(tmp_path, {"shadows": False}))
+    assert places == {(row, col, 512, 512) for row, col in parts}
+    assert len(unskipped) > len(parts)
+
+
 @pytest.mark.parametrize("azimuth_deg", [10.0, 100.0, 190.0, 280.0])
 @pytest.mark.parametrize("view", ["frame", "constant"])
 def test_sweeps_end_behind_the_last_roof_and_nothing_changes(tmp_path, azimuth_deg, view):

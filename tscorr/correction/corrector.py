@@ -186,8 +186,10 @@ class Corrector:
     def _set_states(self, material: Array, results: "_Results") -> None:
         """The flags of a block that follow from its materials alone: negligible, or none that is known."""
         unknown = material == 0
-        results.flags[unknown] = UNKNOWN_MATERIAL
-        results.tally.states[0, SpecularState.NOT_ASSESSED] = np.count_nonzero(unknown)
+        without = np.count_nonzero(unknown)
+        if without > 0:
+            results.flags[unknown] = UNKNOWN_MATERIAL
+        results.tally.states[0, SpecularState.NOT_ASSESSED] = without
         for row in range(1, len(results.tally.states)):
             results.tally.states[row, SpecularState.NEGLIGIBLE] = np.count_nonzero(material == row)
 

@@ -4,7 +4,7 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,14 +14,14 @@ from rasterio.enums import Resampling
 
 from tscorr import config, rasters
 from tscorr.correction.edges import dilated, rim
-from tscorr.errors import InputError, OutputError
+from tscorr.errors import OutputError
 from tscorr.grid import Block, blocks
 from tscorr.scene.directions import obs_normals
 from tscorr.scene.plan import Scene
+from tscorr.scene.survey import HeightSurvey
 from tscorr.sensor import ConstantView, FrameView, LineView
 from tscorr.terrain import shadows
 from tscorr.terrain.bitmask import BitMask
-from tscorr.terrain.roof_planes import height_noise
 from tscorr.terrain.surface import DsmSurface, FlatSurface, GivenNormals, RoofPlaneSurface, Surface
 
 Array = NDArray[Any]
@@ -30,9 +30,8 @@ STRIP_ROWS = 512, 256, 128, 64
 """rows or columns that a sweep reads at once: the most of these with which it reads no more than STRIP_PIXELS, which
 take ten bytes each; as many as a tile has where that can be, since each is decoded once then"""
 STRIP_PIXELS = 16e6
-SAMPLE_PX = 256
-SAMPLES = 4
-"""the survey looks at SAMPLES x SAMPLES windows of SAMPLE_PX"""
+RELIEF_PX = 512, 2048
+"""rows and columns that are looked at at once for the lowest and the highest point"""
 MARGIN_PX = 512
 """pixels around the image that are looked at for what they hide; farther things cast no shadow"""
 TALLEST_M = 300.0
@@ -91,48 +90,23 @@ class Ground:
 
     @property
     def surface(self) -> Surface:
-        """The surface; its heights are surveyed when it is first asked for."""
+        """The surface; its files are opened when it is first asked for."""
         with self._lock:
             if self._known_surface is None:
-                level_m, noise_m = self._survey()
-                self._known_surface = self._surface(level_m, noise_m)
+                self._known_surface = self._surface()
             return self._known_surface
 
-    def _survey(self) -> tuple[float, float]:
-        """Middle height and noise of the surface, from windows spread over the scene. [m]"""
-        if self._heights is None:
-            return 0.0, 0.0
-        rows, cols = self._scene.image.shape
-        corners = {
-            (
-                max(0, round((rows - SAMPLE_PX) * i / (SAMPLES - 1))),
-                max(0, round((cols - SAMPLE_PX) * j / (SAMPLES - 1))),
-            )
-            for i in range(SAMPLES)
-            for j in range(SAMPLES)
-        }
-        windows = [
-            self._read_heights(Block(row, col, min(SAMPLE_PX, rows - row), min(SAMPLE_PX, cols - col)))
-            for row, col in sorted(corners)
-        ]
-        heights = np.concatenate([window[np.isfinite(window)] for window in windows])
-        if not heights.size:
-            raise InputError(f"the surface model {self._heights.info.path} holds no heights under the image")
-        noise = float(np.median([height_noise(window) for window in windows]))
-        return float(np.median(heights)), noise
-
-    def _surface(self, level_m: float, noise_m: float) -> Surface:
+    def _surface(self) -> Surface:
         settings = self._scene.settings.surface
-        cell_x_m, cell_y_m = self._scene.grid.cell_size
         if isinstance(settings, config.FlatSettings):
             return FlatSurface(settings.height_m)
-        heights = self._shared_heights
-        if isinstance(settings, config.DsmSettings) and settings.kind == "roof_planes":
-            assert heights is not None
-            return RoofPlaneSurface(heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level_m, noise_m=noise_m)
         dsm: Surface = FlatSurface(0.0)
-        if heights is not None:
-            dsm = DsmSurface(heights, cell_x_m=cell_x_m, cell_y_m=cell_y_m, level_m=level_m, noise_m=noise_m)
+        if self._heights is not None and self._shared_heights is not None:
+            cell_x_m, cell_y_m = self._scene.grid.cell_size
+            by_planes = isinstance(settings, config.DsmSettings) and settings.kind == "roof_planes"
+            survey = HeightSurvey(self._heights, self._scene.image.shape)
+            kind = RoofPlaneSurface if by_planes else DsmSurface
+            dsm = kind(self._shared_heights, survey, cell_x_m=cell_x_m, cell_y_m=cell_y_m)
         if isinstance(settings, config.DsmSettings):
             return dsm
         info = self._scene.surface_files[-1]
@@ -244,7 +218,7 @@ class Ground:
 
     def _margin(self, zenith_deg: float) -> int:
         """Pixels around the image that can hide something in it from a source at this zenith angle."""
-        return self._reach_px(TALLEST_M, zenith_deg) if self._reaches_beyond() else 0
+        return self._reach_px(TALLEST_M, zenith_deg) if self._reaches_beyond else 0
 
     def _reach_px(self, relief_m: float, zenith_deg: float) -> int:
         """How far something may be that hides a pixel."""
@@ -255,15 +229,16 @@ class Ground:
         """From the lowest to the highest point of the surface model, about the rows that will be asked for. [m]"""
         rows, cols = self._scene.image.shape
         first, last = self._rows or (0, rows)
-        beyond = MARGIN_PX if self._reaches_beyond() else 0
+        beyond = MARGIN_PX if self._reaches_beyond else 0
         first, last = max(first - MARGIN_PX, -beyond), min(last + MARGIN_PX, rows + beyond)
         lowest, highest = np.inf, -np.inf
-        for block in blocks((last - first, cols + 2 * beyond), (SAMPLE_PX * 2, SAMPLE_PX * 8)):
+        for block in blocks((last - first, cols + 2 * beyond), RELIEF_PX):
             heights = self._read_heights(Block(block.row + first, block.col - beyond, block.height, block.width))
             known = heights[np.isfinite(heights)]
             lowest, highest = known.min(initial=lowest), known.max(initial=highest)
         return float(max(highest - lowest, 0.0))
 
+    @cached_property
     def _reaches_beyond(self) -> bool:
         """Whether the surface model covers more than the image."""
         assert self._heights is not None

@@ -1,7 +1,8 @@
 """A scene from files to files: read, correct, write, in blocks, by several workers."""
 
+import threading
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -330,25 +331,26 @@ def _weight(confidence: Array) -> Array:
 
 
 def run_all(work: Callable[[Block], int], todo: list[Block], workers: int, progress: Progress) -> None:
-    """Call `work` for every block in a bounded queue; the first exception is raised once the rest stopped."""
-    waiting = iter(todo)
+    """Call `work` for every block; a worker takes the next as soon as it is free.
+
+    progress : called by one worker at a time. The first exception is raised once the others have stopped.
+    """
+    waiting, turn, stopped = iter(todo), threading.Lock(), threading.Event()
+
+    def one_after_another() -> None:
+        done = 0
+        while True:
+            with turn:
+                progress(done)
+                block = None if stopped.is_set() else next(waiting, None)
+            if block is None:
+                return
+            done = work(block)
+
     with ThreadPoolExecutor(workers) as pool:
-        running: set[Future[int]] = set()
         try:
-            for block in waiting:
-                running.add(pool.submit(work, block))
-                if len(running) > workers:
-                    running = _finish_some(running, progress)
-            while running:
-                running = _finish_some(running, progress)
+            for worker in as_completed([pool.submit(one_after_another) for _ in range(workers)]):
+                worker.result()
         except BaseException:
-            for future in running:
-                future.cancel()
+            stopped.set()
             raise
-
-
-def _finish_some(running: set[Future[int]], progress: Progress) -> set[Future[int]]:
-    done, rest = wait(running, return_when=FIRST_COMPLETED)
-    for future in done:
-        progress(future.result())
-    return rest

@@ -29,6 +29,18 @@ class Relief(NamedTuple):
     unreliable: Array | None
 
 
+class Survey(Protocol):
+    """What is known of the heights of a whole scene; found out when it is first asked for."""
+
+    @property
+    def level_m(self) -> float:
+        """The height that stands in for a void where the sensor's direction is computed."""
+
+    @property
+    def noise_m(self) -> float:
+        """1 sigma of the uncorrelated noise of the heights."""
+
+
 class Surface(Protocol):
     """Heights and normals of blocks of a scene."""
 
@@ -75,20 +87,17 @@ class FlatSurface(Surface):
 class DsmSurface(Surface):
     """The surface of a DSM, with normals by Horn's 3 x 3 weights.
 
-    read     : heights of a block, nan where void.
-    level_m  : height that stands in for a void where the sensor's direction is computed.
-    noise_m  : 1 sigma of the uncorrelated noise of the heights.
+    read : heights of a block, nan where void.
     """
 
-    def __init__(self, read: Read, *, cell_x_m: float, cell_y_m: float, level_m: float, noise_m: float = 0.0) -> None:
+    def __init__(self, read: Read, survey: Survey, *, cell_x_m: float, cell_y_m: float) -> None:
         self._read = read
+        self._survey = survey
         self._cell = {"cell_x_m": cell_x_m, "cell_y_m": cell_y_m}
-        self._level_m = level_m
-        self._noise_m = noise_m
 
     def heights(self, block: Block) -> Array:
         """Heights (rows, cols). [m]"""
-        return _filled(self._read(block), self._level_m)
+        return _filled(self._read(block), self._survey)
 
     def normals(self, block: Block) -> tuple[Array, Array | None]:
         """Normals of the 3 x 3 windows."""
@@ -98,9 +107,21 @@ class DsmSurface(Surface):
     def relief(self, block: Block, wanted: Array | None = None) -> Relief:
         """Heights, and normals of the 3 x 3 windows; they are read once for both."""
         halo = HORN_HALO_PX
-        around = self._read(block.padded(halo))
+        around = self._around(block, wanted)
         normals, unreliable = horn_normals(around, halo=halo, wanted=wanted, **self._cell)
-        return Relief(_filled(around[halo:-halo, halo:-halo], self._level_m), normals, unreliable)
+        return Relief(_filled(around[halo:-halo, halo:-halo], self._survey), normals, unreliable)
+
+    def _around(self, block: Block, wanted: Array | None) -> Array:
+        """Heights of a block and its apron; where no window reaches into the apron it is made up, not read."""
+        halo = HORN_HALO_PX
+        if wanted is None or wanted.size == 0:
+            return self._read(block.padded(halo))
+        edges = wanted[:halo], wanted[-halo:], wanted[:, :halo], wanted[:, -halo:]
+        top, bottom, left, right = (halo * bool(edge.any()) for edge in edges)
+        part = Block(block.row - top, block.col - left, block.height + top + bottom, block.width + left + right)
+        missing = (halo - top, halo - bottom), (halo - left, halo - right)
+        heights = self._read(part)
+        return heights if not np.any(missing) else np.pad(heights, missing, mode="edge")
 
     def normal_sigma_deg(self, block: Block) -> Array:
         """From the noise of the heights, (rows, cols). [deg]
@@ -108,7 +129,7 @@ class DsmSurface(Surface):
         Each slope is sum(weight height) / 8 cells with Horn's weights +-(1, 2, 1): its error is sqrt(12) / 8 of the
         noise a cell. It turns the normal by cos^2 of the tilt downhill and by cos across; the rms of both.
         """
-        slope = self._noise_m * math.sqrt(12.0) / 8.0 / min(self._cell.values())
+        slope = self._survey.noise_m * math.sqrt(12.0) / 8.0 / min(self._cell.values())
         up = self.normals(block)[0][2]
         return np.rad2deg(slope * np.sqrt((up**4 + up**2) / 2)).astype(np.float32)
 
@@ -123,17 +144,15 @@ class RoofPlaneSurface(Surface):
     def __init__(
         self,
         read: Read,
+        survey: Survey,
         *,
         cell_x_m: float,
         cell_y_m: float,
-        level_m: float,
-        noise_m: float,
         tiles_kept: int = 12,
     ) -> None:
         self._read = read
+        self._survey = survey
         self._cell = {"cell_x_m": cell_x_m, "cell_y_m": cell_y_m}
-        self._level_m = level_m
-        self._noise_m = noise_m
         self._tiles: OrderedDict[tuple[int, int], RoofPlanes] = OrderedDict()
         self._kept = tiles_kept
         self._locks: dict[tuple[int, int], threading.Lock] = {}
@@ -141,7 +160,7 @@ class RoofPlaneSurface(Surface):
 
     def heights(self, block: Block) -> Array:
         """Heights (rows, cols). [m]"""
-        return _filled(self._read(block), self._level_m)
+        return _filled(self._read(block), self._survey)
 
     def normals(self, block: Block) -> tuple[Array, Array]:
         """Normals of the faces that the pixels belong to."""
@@ -171,7 +190,7 @@ class RoofPlaneSurface(Surface):
                 if key in self._tiles:
                     self._tiles.move_to_end(key)
                     return self._tiles[key]
-            found = roof_planes(self._read(tile.padded(HALO_PX)), noise_m=self._noise_m, **self._cell)
+            found = roof_planes(self._read(tile.padded(HALO_PX)), noise_m=self._survey.noise_m, **self._cell)
             inner = (slice(HALO_PX, -HALO_PX), slice(HALO_PX, -HALO_PX))
             planes = RoofPlanes(
                 found.normals[:, *inner].copy(), found.unreliable[inner].copy(), found.sigma_deg[inner].copy()
@@ -208,9 +227,9 @@ class GivenNormals(Surface):
         return np.zeros((1, 1), np.float32)
 
 
-def _filled(heights: Array, level_m: float) -> Array:
+def _filled(heights: Array, survey: Survey) -> Array:
     void = np.isnan(heights)
-    return np.where(void, np.float32(level_m), heights) if void.any() else heights
+    return np.where(void, np.float32(survey.level_m), heights) if void.any() else heights
 
 
 def _common(block: Block, other: Block) -> tuple[slice, slice]:
