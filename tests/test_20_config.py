@@ -165,6 +165,16 @@ def test_missing_tables_are_named(tmp_path):
     assert {line.split(": ")[1] for line in problems(path)} == {"materials is missing", "scenes is missing"}
 
 
+def test_one_pair_of_brackets_is_one_too_few(tmp_path):
+    path = tmp_path / "city.toml"
+    path.write_text('[materials.classes]\n1 = "roof_tile"\n[scenes]\nimage = "image.tif"\n')
+    assert problems(path) == [f"{path}: [scenes] is one table; allowed is one for each scene, headed [[scenes]]"]
+
+
+def test_results_need_a_folder(tmp_path):
+    assert "output.directory = ''" in problem_of(tmp_path, output={"directory": ""})
+
+
 def test_every_problem_is_listed_at_once(tmp_path):
     path = write_config(tmp_path, {"quantity": "x", "imag": "y"}, model={"form": "z"})
     assert len(problems(path)) == 3

@@ -19,6 +19,7 @@ from click.testing import CliRunner
 from small_scene import (
     BANDS,
     METAL,
+    NODATA,
     SCENE,
     SHAPE,
     TILE,
@@ -471,6 +472,19 @@ def test_explain_tells_what_the_run_did(tmp_path):
         corrected = read_raster(folder / "corrected.tif")[band, 8, 9]
         expected = [f"{value * 1e-4:.5f}" for value in (*stored, corrected)]
         assert result.stdout.splitlines()[band - 3].split()[-3:] == expected, wavelength
+
+
+def test_explain_gives_no_numbers_for_no_data(tmp_path):
+    config = small_scene(tmp_path)
+    values = image_values()
+    values[1, 8, 9] = NODATA
+    write_image(tmp_path / "image.tif", values)
+    result = tscorr("explain", config, "--scene", "roofs", "--pixel", 8, 9)
+    assert "NODATA" in values_of(result.stdout)["set"]
+    first, second, third = result.stdout.splitlines()[-3:]
+    assert second.endswith("no data")
+    assert f"{NODATA * 1e-4:.5f}" not in result.stdout
+    assert all(len(line.split()) > 3 for line in (first, third))
 
 
 def test_explain_writes_nothing(tmp_path):

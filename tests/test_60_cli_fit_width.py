@@ -59,6 +59,14 @@ def test_fit_does_not_write_what_did_not_converge(measured, tmp_path, monkeypatc
     assert not (tmp_path / "m.toml").exists()
 
 
+def test_fit_names_no_file_that_it_did_not_write(measured, tmp_path, monkeypatch):
+    run("fit", measured, "-o", tmp_path / "m.toml")
+    before = (tmp_path / "m.toml").read_bytes()
+    monkeypatch.setattr("tscorr.fit.solver.MAX_EVALUATIONS", 2)
+    assert "m.toml" not in run("fit", measured, "-o", tmp_path / "m.toml").stdout
+    assert (tmp_path / "m.toml").read_bytes() == before
+
+
 def test_fit_reads_what_a_spreadsheet_writes(measured):
     """Semicolons, and names of columns as one likes to write them."""
     plain = run("fit", measured).stdout

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -18,6 +18,10 @@ from tscorr.cli.common import (
 )
 from tscorr.cli.scenes import progress_bars
 from tscorr.errors import ConfigError, InputError
+
+if TYPE_CHECKING:
+    from tscorr.fit.files import FittedFiles
+    from tscorr.scene.samples import FittedScenes
 
 
 @click.command()
@@ -72,29 +76,30 @@ def fit(
         raise ConfigError("give files of measurements, or --scenes CONFIG" + (", not both" if files else ""))
     can_be_written("-o", output)
     held = None if k == "free" else number("--k", k, "a number or 'free'")
+    fitted: FittedFiles | FittedScenes
     if config is None:
         from tscorr.fit import FitSettings, fit_files
 
         settings = FitSettings(k=held, form=form, bootstrap=bootstrap)
         only = None if wavelengths is None else [number("--wavelengths", um, "um,um") for um in wavelengths.split(",")]
         fitted = fit_files(files, output, name=name, wavelengths_um=only, settings=settings, plot_directory=plot)
-        text, unfinished = fitted.text, fitted.unfinished
     else:
         given = {"--name": name, "--wavelengths": wavelengths, "--bootstrap": bootstrap, "--plot": plot}
         for option in (option for option, value in given.items() if value):
             raise ConfigError(f"{option} is for files of measurements; leave it out with --scenes")
-        text, unfinished = _fit_to_scenes(config, output, held, form)
-    click.echo(text)
-    if output is not None and output.exists():
+        fitted = _fit_to_scenes(config, output, held, form)
+    click.echo(fitted.text)
+    if output is not None and len(fitted.unfinished) < len(fitted.results):
         click.echo(f"materials: {output}")
-    if unfinished:
-        raise InputError(f"fits that did not converge, and of which no material is written: {', '.join(unfinished)}")
+    if fitted.unfinished:
+        names = ", ".join(fitted.unfinished)
+        raise InputError(f"fits that did not converge, and of which no material is written: {names}")
 
 
 def _fit_to_scenes(
     config: Path, output: Path | None, k: float | None, form: Literal["full", "simplified"]
-) -> tuple[str, tuple[str, ...]]:
-    """Fit the materials of a configuration to its scenes; the result as text, and what did not converge."""
+) -> "FittedScenes":
+    """Fit the materials of a configuration to its scenes."""
     from tscorr import batch
     from tscorr.config import load_config
     from tscorr.fit.scenes import SceneFitSettings
@@ -103,8 +108,7 @@ def _fit_to_scenes(
     if k is None:
         raise ConfigError("--k free is for files of measurements: images do not tell n, t1 and k apart")
     with progress_bars(enabled=sys.stderr.isatty()) as progress:
-        fitted = fit_scenes(batch.plan(load_config(config)), output, SceneFitSettings(k=k, form=form), progress)
-    return fitted.text, fitted.unfinished
+        return fit_scenes(batch.plan(load_config(config)), output, SceneFitSettings(k=k, form=form), progress)
 
 
 @click.command()

@@ -184,6 +184,8 @@ def _problem(path: Path, item: Mapping[str, Any], data: Mapping[str, Any]) -> st
         return f"{path}: {where} is missing"
     if where == "file":
         return f"{path}: {message}"
+    if where == "scenes" and isinstance(item["input"], dict):
+        return f"{path}: [scenes] is one table; allowed is one for each scene, headed [[scenes]]"
     if item["input"] == FILL_IN:
         return f"{path}: {where} = {FILL_IN!r} is still to be filled in"
     for kind, allowed in IN_WORDS.items():

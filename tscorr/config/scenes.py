@@ -123,7 +123,9 @@ class NormalsSettings(Section):
     """`surface` of kind normals: unit vectors that are known already."""
 
     kind: Literal["normals"]
-    path: str = Field(description="raster of three bands: east, north, up", examples=["normals.tif"])
+    path: str = Field(
+        description="raster of three bands: east, north, up of the image's grid", examples=["normals.tif"]
+    )
     heights: str | None = Field(None, description="raster of heights, for shadows [m]")
 
 

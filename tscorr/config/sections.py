@@ -15,7 +15,7 @@ Method = Literal["subtract", "ratio", "reference"]
 class Output(Section):
     """[output]: where results go, and which."""
 
-    directory: str = Field("out", description="folder for the results, relative to this file")
+    directory: str = Field("out", min_length=1, description="folder for the results, relative to this file")
     products: list[Product] = Field(["corrected", "flags", "removed"], description="rasters to write")
     format: Literal["gtiff", "cog", "envi"] = Field(
         "gtiff", description="GeoTIFF laid out as the image, cloud-optimised GeoTIFF, or ENVI (.dat and .hdr)"

@@ -48,19 +48,19 @@ def explanation(scene: Scene, row: int, col: int) -> dict[str, dict[str, Any]]:
     state = SpecularState(int(specular_state(result.flags)[0, 0])).name.lower()
     lines["flags"] = {"bits": flags, "state": state, "set": _names(flags)}
     assert result.removed is not None
-    scale, offset = scene.stored.scale, scene.stored.offset
     lines["reflectance factor: seen, removed, corrected"] = {
-        name: "  ".join(
-            f"{value:9.5f}"
-            for value in (
-                stored[b, 0, 0] * scale[b] + offset[b],
-                result.removed[b, 0, 0] * scale[b],
-                result.corrected[b, 0, 0] * scale[b] + offset[b],
-            )
-        )
+        name: _values(scene, b, stored[b, 0, 0], result.removed[b, 0, 0], result.corrected[b, 0, 0])
         for b, name in enumerate(scene.image.names)
     }
     return lines
+
+
+def _values(scene: Scene, band: int, seen: Any, removed: Any, corrected: Any) -> str:
+    """Stored values of a band as reflectance factors, or what stands for no value."""
+    scale, offset = scene.stored.scale[band], scene.stored.offset[band]
+    no_data = not np.isfinite(seen) or seen == scene.stored.nodata
+    values = seen * scale + offset, removed * scale, corrected * scale + offset
+    return "no data" if no_data else "  ".join(f"{value:9.5f}" for value in values)
 
 
 def _names(flags: int) -> str:
