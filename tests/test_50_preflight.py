@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -133,6 +134,23 @@ def test_an_image_brighter_than_white_is_doubted(tmp_path, caplog, values, keys,
     batch.plan(load_config(write_config(tmp_path, {"name": "a", **keys}, {"name": "b", **keys})))
     told = "" if middle is None else f"the image {tmp_path}/image.tif shows reflectance factors about {middle}, and 1"
     assert caplog.text.count(told or "reflectance factors") == (middle is not None)
+
+
+@pytest.mark.parametrize(("saturation", "told"), [(0.9, True), (2999.0, True), (65535.0, False), (None, False)])
+def test_a_saturation_that_half_of_the_image_exceeds_is_doubted(tmp_path, caplog, saturation, told):
+    write_inputs(tmp_path)
+    write_raster(tmp_path / "image.tif", np.full((BANDS, *SHAPE), 3000, np.uint16))
+    keys = {"scale": 1e-4} | ({} if saturation is None else {"saturation": saturation})
+    batch.plan(load_config(write_config(tmp_path, keys)))
+    assert (f"half of the image {tmp_path}/image.tif is saturated" in caplog.text) == told == (caplog.text != "")
+
+
+@pytest.mark.parametrize(("year", "told"), [(1899, True), (1900, False), (2024, False), (2101, True)])
+def test_a_sun_of_no_year_of_aerial_images_is_doubted(tmp_path, caplog, year, told):
+    write_inputs(tmp_path)
+    time = datetime(year, 6, 21, 12, tzinfo=UTC)
+    batch.plan(load_config(write_config(tmp_path, {"sun": {"time": time}})))
+    assert (f"scene 'roofs': the sun is that of the year {year}" in caplog.text) == told == (caplog.text != "")
 
 
 @pytest.mark.parametrize(

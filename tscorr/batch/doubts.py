@@ -14,14 +14,18 @@ TOO_BRIGHT = 1.5
 COVERED = 0.98
 SAMPLE_PX = 256
 """side of what is looked at in the middle of an image"""
+YEARS = 1900, 2100
+"""in which images are taken from the air, or will be"""
 
 
 def warn(planned: Sequence[Scene]) -> None:
     """Say what is doubtful about scenes."""
     _of_missing_scales(planned)
-    for scene in {(scene.image.dtype, scene.stored.scale, scene.stored.offset): scene for scene in planned}.values():
-        _of_brightness(scene)  # one image of each kind: what is wrong with it mostly is with all
+    kinds = {(s.image.dtype, s.stored.scale, s.stored.offset, s.stored.saturation): s for s in planned}
+    for scene in kinds.values():
+        _of_values(scene)  # one image of each kind: what is wrong with it mostly is with all
     for scene in planned:
+        _of_time(scene)
         _of_coverage(scene)
         surface = scene.settings.surface
         if scene.settings.shadows and isinstance(surface, config.NormalsSettings) and surface.heights is None:
@@ -47,22 +51,37 @@ def _lacks_scale(scene: Scene) -> bool:
     return scene.image.dtype.kind in "iu" and scene.settings.scale is None and set(scene.image.scales) == {1.0}
 
 
-def _of_brightness(scene: Scene) -> None:
-    """Per cent, radiances or counts in place of reflectance factors."""
+def _of_time(scene: Scene) -> None:
+    """A year with a digit too few."""
+    time = scene.sun.time
+    if time is not None and not YEARS[0] <= time.year <= YEARS[1]:
+        log.warning("scene '%s': the sun is that of the year %d; is that meant?", scene.name, time.year)
+
+
+def _of_values(scene: Scene) -> None:
+    """Per cent, radiances or counts in place of reflectance factors; `saturation` in place of a stored value."""
     image, stored = scene.image, scene.stored
     as_vrt = scene.config.output.corrected == "vrt"  # then the image is read only where it must be
-    if _lacks_scale(scene) or as_vrt or (image.bad_bands and image.bad_bands[0]):
+    if as_vrt or (image.bad_bands and image.bad_bands[0]):
         return
     try:
-        middle = rasters.middle_value(image, SAMPLE_PX, stored.nodata) * stored.scale[0] + stored.offset[0]
+        middle = rasters.middle_value(image, SAMPLE_PX, stored.nodata)
     except (TscorrError, OSError):  # its scene will tell
         return
-    if middle > TOO_BRIGHT:
+    if stored.saturation is not None and middle >= stored.saturation[0]:
+        log.warning(
+            "half of the image %s is saturated, with stored values of %g and more: saturation is one of them, not a "
+            "reflectance factor",
+            image.path,
+            stored.saturation[0],
+        )
+    factor = middle * stored.scale[0] + stored.offset[0]
+    if factor > TOO_BRIGHT and not _lacks_scale(scene):
         log.warning(
             "the image %s shows reflectance factors about %.3g, and 1 is white: if these are per cent or counts, give "
             "scale = ...; radiances have to be made reflectances first",
             image.path,
-            middle,
+            factor,
         )
 
 
