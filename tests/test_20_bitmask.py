@@ -1,6 +1,7 @@
 """Masks of a bit a pixel against masks of a byte."""
 
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 import numpy as np
@@ -46,6 +47,14 @@ def test_blocks_of_it_are_those_of_an_array_of_bytes(narrowed, block):
     mask, expected = narrowed
     assert not expected.all()
     np.testing.assert_array_equal(mask.read(block), around(expected, block))
+
+
+def test_threads_may_narrow_it_side_by_side(tmp_path):
+    """Columns that share bytes, each by a thread of its own, many times."""
+    columns = [Block(0, col, 37, 1) for col in range(61)] * 20
+    with closing(BitMask.new(SHAPE, tmp_path)) as mask, ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda block: mask.narrow(block, np.zeros(block.shape, np.bool_)), columns))
+        assert not mask.read(Block(0, 0, *SHAPE)).any()
 
 
 def test_it_is_the_same_out_of_a_file(narrowed, tmp_path):

@@ -1,6 +1,7 @@
 """Shadows and occlusion against closed forms, an independent fine march, and ray-traced truth."""
 
 import csv
+import itertools
 import json
 import math
 from pathlib import Path
@@ -357,6 +358,16 @@ def test_strips_of_any_height_give_the_same_bits(rough):
         assert 0.3 < whole.mean() < 1.0
         for lines in (1, 7, 32, 50):
             assert np.array_equal(swept(make(), rough, lines), whole)
+
+
+def test_the_parts_of_a_sweep_side_by_side_see_what_it_sees(rough):
+    for make in sweeps_of(rough.shape):
+        parts, together = make().parts()[::-1], np.ones(rough.shape, bool)
+        for strips in itertools.zip_longest(*(part.strips(16) for part in parts)):
+            for part, strip in zip(parts, strips, strict=True):
+                if strip is not None:
+                    together[strip.slices] &= part(strip, rough[strip.slices])
+        np.testing.assert_array_equal(together, swept(make(), rough))
 
 
 def test_strips_lie_between_multiples_of_their_depth_and_none_is_empty(rough):

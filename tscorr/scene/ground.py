@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,11 @@ from tscorr import config, rasters
 from tscorr.correction.edges import dilated, rim
 from tscorr.errors import OutputError
 from tscorr.grid import Block, blocks
+from tscorr.scene.cutting import threads_of
 from tscorr.scene.directions import obs_normals
 from tscorr.scene.plan import Scene
 from tscorr.scene.survey import HeightSurvey
+from tscorr.scene.threads import together
 from tscorr.sensor import ConstantView, FrameView, LineView
 from tscorr.terrain import shadows
 from tscorr.terrain.bitmask import BitMask
@@ -27,9 +29,9 @@ from tscorr.terrain.surface import DsmSurface, FlatSurface, GivenNormals, RoofPl
 Array = NDArray[Any]
 
 STRIP_ROWS = 512, 256, 128, 64
-"""rows or columns that a sweep reads at once: the most of these with which it reads no more than STRIP_PIXELS, which
-take ten bytes each; as many as a tile has where that can be, since each is decoded once then"""
-STRIP_PIXELS = 16e6
+"""rows or columns that a sweep reads at once: the most of these with which all sweeps together read no more than
+STRIP_PIXELS, which take ten bytes each; as many as a tile has where that can be, since each is decoded once then"""
+STRIP_PIXELS = 20e6
 RELIEF_PX = 512, 2048
 """rows and columns that are looked at at once for the lowest and the highest point"""
 MARGIN_PX = 512
@@ -39,6 +41,13 @@ TALLEST_M = 300.0
 STEEPEST_DEG = 80.0
 """beyond it what hides a pixel is further than MARGIN_PX anyway"""
 LIT, SEEN, RELIEF = "lit.bits", "seen.bits", "relief.txt"
+
+
+class _Sweep(NamedTuple):
+    """A sweep that starts so many pixels beyond the image."""
+
+    margin: int
+    sweep: shadows.Sweep
 
 
 class Ground:
@@ -138,11 +147,16 @@ class Ground:
                 self._relief_m = float((masks / RELIEF).read_text(encoding="ascii"))
             return
         self._rows = rows
-        sun = self._scene.sun.center
-        self._lit = self._swept(lambda _, **scene: shadows.DirectionSweep(direction=sun, **scene), _zenith_deg(sun))
-        self._seen = self._seen_mask()
-        if self._seen is None:
+        of_sun, of_view = self._sweep_of_sun(), self._sweep_of_view()
+        self._lit = self._new_mask()
+        passes = [(self._lit, of_sun.margin, part) for part in of_sun.sweep.parts()]
+        if of_view is None:
             self._relief_m = self._relief()
+        else:
+            self._seen = self._new_mask()
+            passes += [(self._seen, of_view.margin, part) for part in of_view.sweep.parts()]
+        threads = max(1, min(threads_of(self._scene), len(passes)))
+        together([partial(self._pass, *each, STRIP_PIXELS / threads) for each in passes], threads)
 
     def _loaded(self, path: Path) -> BitMask | None:
         """A mask that was saved, or None where there is none."""
@@ -157,21 +171,25 @@ class Ground:
                 mask.save(folder / name)
         (folder / RELIEF).write_text(repr(self._relief_m), encoding="ascii")
 
-    def _seen_mask(self) -> BitMask | None:
-        """What a sensor sees, where one sweep can tell; otherwise it is found block by block."""
+    def _sweep_of_sun(self) -> "_Sweep":
+        sun = self._scene.sun.center
+        return self._sweep(lambda _, **scene: shadows.DirectionSweep(direction=sun, **scene), _zenith_deg(sun))
+
+    def _sweep_of_view(self) -> "_Sweep | None":
+        """Where one sweep can tell what the sensor sees; otherwise it is found block by block."""
         view, grid = self._scene.view, self._scene.grid
         if isinstance(view, ConstantView):
             direction = view.vectors(grid, Block(0, 0, 1, 1), np.zeros((1, 1)))[:, 0, 0]
-            return self._swept(
+            return self._sweep(
                 lambda _, **scene: shadows.DirectionSweep(direction=direction, **scene), _zenith_deg(direction)
             )
         if isinstance(view, FrameView):
             position = view.position
-            return self._swept(
+            return self._sweep(
                 lambda local, **scene: shadows.FrameSweep(position=local(position), **scene), self._steepest_deg()
             )
         if isinstance(view, LineView) and (ends := view.straight(grid)) is not None:
-            return self._swept(
+            return self._sweep(
                 lambda local, **scene: shadows.LineSweep(start=local(ends[0]), end=local(ends[1]), **scene),
                 self._steepest_deg(),
             )
@@ -187,12 +205,11 @@ class Ground:
         ]
         return max((zenith for zenith in zeniths if np.isfinite(zenith)), default=0.0)
 
-    def _swept(self, sweep_of: Callable[..., shadows.Sweep], zenith_deg: float) -> BitMask:
-        """The mask of a sweep over the image, and over what lies around it and may hide something in it.
+    def _sweep(self, sweep_of: Callable[..., shadows.Sweep], zenith_deg: float) -> "_Sweep":
+        """A sweep over the image, and over what lies around it and may hide something in it.
 
         sweep_of   : given a function that puts a position into the place of what is swept, and its shape and cells.
         zenith_deg : of the source, at most.
-        OutputError where the disk has no room for it.
         """
         rows, cols = self._scene.image.shape
         cell_x_m, cell_y_m = self._scene.grid.cell_size
@@ -204,17 +221,36 @@ class Ground:
             return float(position[0] - x0), float(position[1] - y0), float(position[2])
 
         shape = rows + 2 * margin, cols + 2 * margin
-        sweep = sweep_of(local, shape=shape, cell_x_m=cell_x_m, cell_y_m=cell_y_m)
-        lines = next((lines for lines in STRIP_ROWS if lines * max(shape) <= STRIP_PIXELS), STRIP_ROWS[-1])
-        first, last = self._rows or (0, rows)
+        return _Sweep(margin, sweep_of(local, shape=shape, cell_x_m=cell_x_m, cell_y_m=cell_y_m))
+
+    def _new_mask(self) -> BitMask:
+        """Where nothing is hidden so far. OutputError where the disk has no room for it."""
         try:
-            mask = self._files.enter_context(closing(BitMask.new((rows, cols), self._folder)))
-            for strip in sweep.strips(lines, (first + margin - 1, last + margin + 1)):
-                block = Block(strip.row - margin, strip.col - margin, strip.height, strip.width)
-                mask.narrow(block, sweep(strip, self._read_heights(block)))
+            return self._files.enter_context(closing(BitMask.new(self._scene.image.shape, self._folder)))
         except OSError as error:
-            raise OutputError(f"the mask of shadows cannot be written to {self._folder}: {error}") from None
-        return mask
+            raise self._no_room(error) from None
+
+    def _pass(self, mask: BitMask, margin: int, sweep: shadows.Sweep, pixels: float, stopped: threading.Event) -> None:
+        """Take out of a mask what a sweep finds hidden, which starts `margin` pixels beyond the image.
+
+        pixels : that are read at a time, at most. OutputError where the disk has no room.
+        """
+        rows, cols = self._scene.image.shape
+        longest = max(rows, cols) + 2 * margin
+        lines = next((lines for lines in STRIP_ROWS if lines * longest <= pixels), STRIP_ROWS[-1])
+        first, last = self._rows or (0, rows)
+        for strip in sweep.strips(lines, (first + margin - 1, last + margin + 1)):
+            if stopped.is_set():
+                return
+            block = Block(strip.row - margin, strip.col - margin, strip.height, strip.width)
+            visible = sweep(strip, self._read_heights(block))
+            try:
+                mask.narrow(block, visible)
+            except OSError as error:
+                raise self._no_room(error) from None
+
+    def _no_room(self, error: OSError) -> OutputError:
+        return OutputError(f"the mask of shadows cannot be written to {self._folder}: {error}")
 
     def _margin(self, zenith_deg: float) -> int:
         """Pixels around the image that can hide something in it from a source at this zenith angle."""

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from tscorr.scene.plan import Scene
 from tscorr.scene.products import write_corrected_vrt, writer_of, written_products
 from tscorr.scene.skipping import SHADOW_OR_NODATA, Idle, Skipping, tallied
 from tscorr.scene.sums import Sums
+from tscorr.scene.threads import together
 
 Array = NDArray[Any]
 Progress = Callable[[int], None]
@@ -335,9 +336,9 @@ def run_all(work: Callable[[Block], int], todo: list[Block], workers: int, progr
 
     progress : called by one worker at a time. The first exception is raised once the others have stopped.
     """
-    waiting, turn, stopped = iter(todo), threading.Lock(), threading.Event()
+    waiting, turn = iter(todo), threading.Lock()
 
-    def one_after_another() -> None:
+    def one_after_another(stopped: threading.Event) -> None:
         done = 0
         while True:
             with turn:
@@ -347,10 +348,4 @@ def run_all(work: Callable[[Block], int], todo: list[Block], workers: int, progr
                 return
             done = work(block)
 
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            for worker in as_completed([pool.submit(one_after_another) for _ in range(workers)]):
-                worker.result()
-        except BaseException:
-            stopped.set()
-            raise
+    together([one_after_another] * workers, workers)

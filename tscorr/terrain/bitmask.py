@@ -3,6 +3,7 @@
 import os
 import shutil
 import tempfile
+import threading
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -18,13 +19,14 @@ class BitMask:
     """True everywhere at first; `narrow` clears pixels, `read` answers for blocks, which may reach outside.
 
     shape : (rows, cols) of the scene. file : a bit for each pixel, row by row, set where it was cleared.
-    Any thread may read, and one narrow before. Close it to close its file.
+    Any thread may narrow it, and then any read it. Close it to close its file.
     """
 
     def __init__(self, shape: tuple[int, int], file: BinaryIO) -> None:
         self._shape = shape
         self._row_bytes = -(-shape[1] // 8)
         self._file = file
+        self._lock = threading.Lock()
 
     @classmethod
     def new(cls, shape: tuple[int, int], folder: Path) -> Self:
@@ -64,11 +66,13 @@ class BitMask:
         cleared[:, left - first * 8 : right - first * 8] = ~mask[
             top - block.row : bottom - block.row, left - block.col : right - block.col
         ]
-        bits = self._rows(top, bottom)
-        bits[:, first:last] |= np.packbits(cleared, axis=1)
-        self._file.seek(top * self._row_bytes)
-        self._file.write(bits.data)
-        self._file.flush()
+        packed = np.packbits(cleared, axis=1)
+        with self._lock:
+            bits = self._rows(top, bottom)
+            bits[:, first:last] |= packed
+            self._file.seek(top * self._row_bytes)
+            self._file.write(bits.data)
+            self._file.flush()
 
     def read(self, block: Block) -> Mask:
         """The mask of a block, (rows, cols); beyond the scene it goes on as at the nearest pixel."""

@@ -74,6 +74,10 @@ class Sweep:
         self._ends = [end for leg, end in zip(legs, ends, strict=True) if leg.first < end]
         self._next = (0, self._legs[0].first) if self._legs else None
 
+    def parts(self) -> "list[Sweep]":
+        """One sweep for each leg, instead of this one, which may go on at the same time: visible is what all say."""
+        return [Sweep([leg], self._tolerance_m) for leg in self._legs]
+
     def strips(self, lines: int, rows: tuple[int, int] | None = None) -> Iterator[Strip]:
         """The windows to read; none where nothing can be hidden.
 
