@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+import threading
 import tracemalloc
+from functools import cache
 
 import numpy as np
 import pytest
@@ -60,6 +62,25 @@ def test_tables_of_the_eye_are_the_same_from_another_process_and_from_this_one(m
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     for one, two in zip(asked, eye._asked.__wrapped__(), strict=True):
         assert np.array_equal(one, two)
+
+
+@pytest.mark.parametrize(
+    ("wavelengths", "needed"), [((0.45, 0.55, 0.65), True), ((1.2, 1.6, 2.2), False), ((), False)]
+)
+def test_the_eye_is_asked_ahead_once_where_colours_are_shown(monkeypatch, wavelengths, needed):
+    askers, asked = [], threading.Event()
+
+    def fetch():
+        askers.append(threading.current_thread())
+        asked.set()
+
+    monkeypatch.setattr(eye, "_asked", cache(fetch))
+    quicklook.prepare(wavelengths)
+    assert asked.wait(10 if needed else 0.1) == needed
+    eye.eye()
+    quicklook.prepare(wavelengths)
+    assert len(askers) == 1
+    assert (askers[0] is threading.current_thread()) != needed
 
 
 def test_exposure_multiplies_linear_light():

@@ -41,6 +41,12 @@ def eye() -> Eye:
         return _asked()
 
 
+def ask_ahead() -> None:
+    """Have the tables fetched while other work is done; `eye` waits for them, if need be."""
+    if not _asked.cache_info().currsize:
+        threading.Thread(target=eye, daemon=True).start()
+
+
 @cache
 def _asked() -> Eye:
     """The tables, from another interpreter that finds the same packages; from this one where it has no other."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tscorr.errors import InputError, OutputError
-from tscorr.eye import eye
+from tscorr.eye import ask_ahead, eye
 from tscorr.materials import ALLOWED_WAVELENGTHS, is_wavelength
 
 Array = NDArray[np.float32]
@@ -63,6 +63,12 @@ def rgb_matrix(wavelengths_um: ArrayLike, fwhm_um: ArrayLike | None = None, styl
     else:
         matrix[shown if len(shown) == 3 else shown * 3, [0, 1, 2]] = 1.0
     return matrix.astype(np.float32)
+
+
+def prepare(wavelengths_um: ArrayLike) -> None:
+    """Have what is slow to come for a picture of these bands fetched meanwhile."""
+    if _visible(np.atleast_1d(np.asarray(wavelengths_um, dtype=float))).any():
+        ask_ahead()
 
 
 def shown_bands(wavelengths_um: ArrayLike) -> list[int]:

@@ -20,7 +20,7 @@ from tscorr.grid import Block, Grid, longitude_latitude
 from tscorr.report import SceneFacts, page, summary, write_json
 from tscorr.scene.cutting import threads_of
 from tscorr.scene.memory import give_back, peak_rss_mb
-from tscorr.scene.pictures import PICTURE_PX, Lights, draw_quicklook
+from tscorr.scene.pictures import PICTURE_PX, Lights, draw_quicklook, prepare_quicklook
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import written_products
 from tscorr.scene.run import Pipeline, Progress, silent
@@ -94,6 +94,7 @@ def correct_scene(scene: Scene, progress: Progress = silent) -> dict[str, Any]:
         publish.EarlyHashes(scene.inputs, algorithm) as hashes,
         publish.Publication(target_of(scene), algorithm=algorithm, early=threads_of(scene) > 1) as publication,
     ):
+        prepare_quicklook(scene)
         pipeline = Pipeline(scene, publication.folder, final=publication.hash_early)
         sums, lights, written = pipeline.run(progress), pipeline.lights, pipeline.written
         del pipeline  # and the heights that it keeps

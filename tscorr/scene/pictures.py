@@ -92,6 +92,12 @@ def _are_gathered(scene: "Scene") -> bool:
     return wanted and len(_shown(scene)) <= MOST_GATHERED
 
 
+def prepare_quicklook(scene: "Scene") -> None:
+    """Have what the picture of a scene will need fetched while the scene is computed."""
+    if scene.config.output.quicklook:
+        quicklook.prepare(_good(scene.wavelengths_um, scene.image))
+
+
 def draw_quicklook(
     scene: "Scene",
     folder: Path,
