@@ -227,6 +227,14 @@ def test_trajectories_that_are_refused(tmp_path, text, message):
         read_trajectory(path, GRID)
 
 
+def test_semicolons_and_capitals_are_read(tmp_path):
+    path = tmp_path / "flight.csv"
+    path.write_text(GOOD, "utf-8")
+    plain = read_trajectory(path, GRID)
+    path.write_text(GOOD.replace(",", ";").replace("utc;x;y;z", "UTC;X;Y;Z"), "utf-8")
+    np.testing.assert_array_equal(read_trajectory(path, GRID).table, plain.table)
+
+
 def test_a_spreadsheets_csv_is_read(tmp_path):
     """With a byte-order mark, spaces in the header and columns in another order."""
     path = tmp_path / "flight.csv"

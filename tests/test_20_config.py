@@ -165,6 +165,18 @@ def test_missing_tables_are_named(tmp_path):
     assert {line.split(": ")[1] for line in problems(path)} == {"materials is missing", "scenes is missing"}
 
 
+@pytest.mark.parametrize(
+    ("change", "home"),
+    [
+        ({"correction": {"precision": "fast"}}, "model"),
+        ({"materials": {"classes": {"1": "line"}, "settings": {"line": {"image_noise": [0, 0]}}}}, "correction"),
+        ({"output": {"workers": 2}}, "run"),
+    ],
+)
+def test_a_key_of_another_table_is_sent_there(tmp_path, change, home):
+    assert problem_of(tmp_path, **change).endswith(f" (it is a key of [{home}])")
+
+
 def test_one_pair_of_brackets_is_one_too_few(tmp_path):
     path = tmp_path / "city.toml"
     path.write_text('[materials.classes]\n1 = "roof_tile"\n[scenes]\nimage = "image.tif"\n')

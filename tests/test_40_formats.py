@@ -342,6 +342,14 @@ def test_bad_bands_are_left_as_they_are_and_decide_nothing(tmp_path, output, jun
         assert read_envi(folder / "corrected.dat").numbers("bbl") == [0, 1, 0, 1]
 
 
+@pytest.mark.parametrize("bbl", ["{0, 1}", "{1, 1, 1, 1}", "{good, bad, good}"])
+def test_a_list_of_bad_bands_that_is_of_another_image_is_refused(tmp_path, bbl):
+    image = write_envi(tmp_path / "image.dat", values_of("int16"), bbl=bbl)
+    said = rf"image\.dat: bbl = .*{bbl[1:-1]}.*; allowed is 0 or 1 for each of the 3 bands"
+    with pytest.raises(InputError, match=said):
+        corrected(tmp_path, image)
+
+
 def test_an_image_of_bad_bands_only_is_refused(tmp_path):
     image = write_envi(tmp_path / "image.dat", values_of("int16"), bbl="{0, 0, 0}")
     with pytest.raises(InputError, match=r"image\.dat marks every band as bad"):

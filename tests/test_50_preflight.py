@@ -222,6 +222,18 @@ def test_an_image_whose_blocks_do_not_fit_into_the_limit_is_told(tmp_path):
 
 
 @pytest.mark.usefixtures("no_pixels")
+@pytest.mark.parametrize("limit_mb", [128, 300, 340])
+def test_a_limit_below_what_any_scene_takes_is_told_as_such(tmp_path, limit_mb):
+    small_scene(tmp_path)
+    (line,) = problems(write_config(tmp_path, run={"memory_limit_mb": limit_mb}), ConfigError)
+    assert re.fullmatch(
+        rf"scene 'roofs' takes about 34\d MB of memory, as any scene does; \[run\] memory_limit_mb = {limit_mb}: "
+        "allow more",
+        line,
+    )
+
+
+@pytest.mark.usefixtures("no_pixels")
 def test_a_machine_without_memory_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(preflight, "available_mb", lambda: 100.0)
     (line,) = problems(small_scene(tmp_path), OutputError)

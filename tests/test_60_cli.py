@@ -487,6 +487,35 @@ def test_explain_gives_no_numbers_for_no_data(tmp_path):
     assert all(len(line.split()) > 3 for line in (first, third))
 
 
+def test_explain_invents_no_view(tmp_path):
+    """Where nobody knows from where the pixel was seen: no direction, and no model."""
+    small_scene(tmp_path)
+    zenith = np.full(SHAPE, 40.0, np.float32)
+    zenith[8, 9] = np.nan
+    write_raster(tmp_path / "z.tif", zenith)
+    write_raster(tmp_path / "a.tif", np.zeros(SHAPE, np.float32))
+    config = write_config(tmp_path, {"view": {"kind": "angles", "zenith": "z.tif", "azimuth": "a.tif"}})
+    unknown, known = (tscorr("explain", config, "--pixel", 8, column).stdout for column in (9, 10))
+    assert values_of(unknown)["view"] == values_of(unknown)["seen from"] == "not known"
+    assert "NOT_VIEWED" in values_of(unknown)["set"]
+    assert ("exitance" in unknown, "exitance" in known) == (False, True)
+
+
+def test_explain_says_that_a_material_is_switched_off(tmp_path):
+    small_scene(tmp_path)
+    materials = {"classes": {str(TILE): "roof_tile"}, "settings": {"roof_tile": {"enabled": False}}}
+    off = tscorr("explain", write_config(tmp_path, materials=materials), "--pixel", 8, 9)
+    assert values_of(off.stdout)["enabled"].startswith("false")
+
+
+def test_explain_asks_which_scene_only_where_there_are_several(tmp_path):
+    small_scene(tmp_path)
+    assert tscorr("explain", write_config(tmp_path), "--pixel", 8, 9).exit_code == 0
+    result = tscorr("explain", write_config(tmp_path, {"name": "a"}, {"name": "b"}), "--pixel", 8, 9)
+    assert result.exit_code == 2
+    assert result.stderr == f"tscorr: give --scene: {tmp_path}/city.toml has a, b\n"
+
+
 def test_explain_writes_nothing(tmp_path):
     config = small_scene(tmp_path)
     before = files(tmp_path)

@@ -32,7 +32,7 @@ from small_scene import (
 
 from tscorr.cli import cli
 from tscorr.config import FILL_IN, Config, template
-from tscorr.config.scenes import SURFACES, VIEWS
+from tscorr.config.scenes import SURFACES, VIEWS, Scene, Sun, Truth
 from tscorr.correction import SpecularState, specular_state
 
 ROOT = Path(__file__).parent.parent
@@ -85,6 +85,14 @@ def test_until_they_are_filled_in_the_values_are_named(tmp_path):
     assert "view.position = 'FILL IN'" in result.stderr
     config.write_text(filled(config.read_text()).replace('"roof_tile"', f'"{FILL_IN}"'))
     assert "no material 'FILL IN'" in tscorr("plan", config).stderr
+
+
+def test_init_names_every_key_of_a_scene():
+    """Those of its tables too, whatever their kind."""
+    text = template("image.tif", "class_map.tif", "city")
+    keys = {key for table in (Scene, Sun, Truth, *VIEWS.values(), *SURFACES.values()) for key in table.model_fields}
+    assert {key for key in keys if not re.search(rf"\b{key}\b", text)} == set()
+    assert "None" not in text
 
 
 def test_init_overwrites_nothing_and_names_what_is_wrong(tmp_path, monkeypatch):

@@ -12,11 +12,14 @@ import numpy as np
 from tscorr import config, publish
 from tscorr.errors import ConfigError, OutputError, TscorrError
 from tscorr.scene.correct import is_current, target_of
-from tscorr.scene.cutting import memory_mb
+from tscorr.scene.cutting import BASE_MB, memory_mb
 from tscorr.scene.forecast import available_mb, disk_bytes
 from tscorr.scene.plan import Scene
 
 log = logging.getLogger("tscorr")
+
+LEAST_BLOCKS_MB = 5
+"""what the blocks of any image take"""
 
 
 def preflight(settings: config.Config, planned: Sequence[Scene], *, overwrite: bool) -> Iterator[TscorrError]:
@@ -53,10 +56,12 @@ def _memory(todo: Sequence[Scene]) -> Iterator[TscorrError]:
         need_mb, limit_mb = memory_mb(scene), scene.config.run.memory_limit_mb
         if need_mb > limit_mb:
             rows, cols = scene.image.tile
+            stored = f"since the image {scene.image.path} is stored in blocks of {rows} x {cols} pixels"
+            helps = limit_mb > BASE_MB + LEAST_BLOCKS_MB
+            why, or_else = (stored, ", or store it in smaller tiles") if helps else ("as any scene does", "")
             yield ConfigError(
-                f"scene '{scene.name}' takes about {need_mb:.0f} MB of memory, since the image {scene.image.path} is "
-                f"stored in blocks of {rows} x {cols} pixels; [run] memory_limit_mb = {limit_mb}: allow more, or "
-                f"store it in smaller tiles"
+                f"scene '{scene.name}' takes about {need_mb:.0f} MB of memory, {why}; [run] memory_limit_mb = "
+                f"{limit_mb}: allow more{or_else}"
             )
         elif need_mb > free_mb:
             yield OutputError(

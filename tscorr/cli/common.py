@@ -92,7 +92,7 @@ def with_clear_errors(command: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-COMPILING = "tscorr: compiling for this machine, once: up to half a minute"
+COMPILING = "tscorr: compiling what no run on this machine has needed before: up to half a minute"
 
 
 @contextmanager

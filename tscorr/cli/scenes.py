@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tscorr.cli.common import compilation_told, config_argument, percent, print_table, with_clear_errors
-from tscorr.errors import TscorrError
+from tscorr.errors import ConfigError, TscorrError
 
 if TYPE_CHECKING:
     from tscorr.batch import BatchResult, SceneProgress
@@ -189,16 +189,20 @@ def _listed(entry: dict[str, Any]) -> str:
 
 @click.command()
 @config_argument
-@click.option("--scene", required=True, metavar="NAME")
+@click.option("--scene", metavar="NAME", help="Which, if the configuration has several.")
 @click.option("--pixel", required=True, type=(int, int), metavar="ROW COL", help="From 0, row before column.")
 @with_clear_errors
-def explain(config: Path, scene: str, pixel: tuple[int, int]) -> None:
+def explain(config: Path, scene: str | None, pixel: tuple[int, int]) -> None:
     """Show everything known of one pixel: vectors, angles, F, G, lobe, removed, flags."""
     from tscorr import batch
     from tscorr.config import load_config
     from tscorr.scene.explain import explanation
 
-    (planned,) = batch.plan(load_config(config), [scene])
+    settings = load_config(config)
+    names = [str(entry.name) for entry in settings.scenes]
+    if scene is None and len(names) > 1:
+        raise ConfigError(f"give --scene: {config} has {', '.join(names)}")
+    (planned,) = batch.plan(settings, [scene or names[0]])
     for title, lines in explanation(planned, *pixel).items():
         click.echo(title)
         for name, value in lines.items():
@@ -219,4 +223,6 @@ def verify(folder: Path) -> None:
     for problem in problems:
         click.echo(problem)
     click.echo(f"{len(results)} results, {len(problems)} problems")
+    if problems:
+        click.echo("tscorr run --overwrite computes results again", err=True)
     sys.exit(1 if problems else 0)

@@ -73,7 +73,9 @@ def _facts(image: Path) -> list[str]:
     type=click.Path(dir_okay=False, path_type=Path),
     help=".png, or .exr: linear light.",
 )
-@click.option("--exposure", type=click.FloatRange(0, min_open=True), help="Factor; default: bright parts near white.")
+@click.option(
+    "--exposure", type=click.FloatRange(0, min_open=True), help="Factor; default: bright parts near white, 1 for .exr."
+)
 @click.option("--false-colour", is_flag=True, help="Near-infrared, red and green as red, green and blue.")
 @click.option(
     "--size", type=click.IntRange(16, 20000), default=2048, show_default=True, help="Longest side in pixels."

@@ -174,7 +174,9 @@ def _problem(path: Path, item: Mapping[str, Any], data: Mapping[str, Any]) -> st
         *place, key = location
         known = _known_keys(item["loc"])
         table = ".".join(map(str, place)) or "the top level"
-        return f"{path}: unknown key '{key}' in {table}{nearest(str(key), known)}"
+        homes = [name for name in ("output", "model", "correction", "run") if key in TABLES[name].model_fields]
+        hint = f" (it is a key of [{homes[0]}])" if homes else nearest(str(key), known)
+        return f"{path}: unknown key '{key}' in {table}{hint}"
     message = item["msg"].removeprefix("Value error, ")
     if item["type"] == "union_tag_invalid":
         kinds = SURFACES if location[-1] == "surface" else VIEWS

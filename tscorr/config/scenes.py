@@ -51,7 +51,7 @@ class LineViewSettings(Section):
     kind: Literal["line"]
     trajectory: str = Field(description="CSV: utc,x,y,z[,roll_deg,pitch_deg,heading_deg]", examples=["trajectory.csv"])
     start: AwareDatetime | None = Field(None, description="first time of the line, where the file holds more")
-    end: AwareDatetime | None = None
+    end: AwareDatetime | None = Field(None, description="last time of the line")
     crs: str | None = Field(None, description="of the positions; default: the image's")
     height_offset_m: Number = Field(0.0, description="added to the heights, which are ellipsoidal from GNSS")
 
@@ -145,8 +145,8 @@ SurfaceSettings = Annotated[
 class Truth(Section):
     """`truth` of a synthetic scene: what the image would be without the specular part."""
 
-    diffuse: str = Field(description="reflectance factor without the specular part")
-    sunlit: str = Field(description="1 where the sun shines")
+    diffuse: str = Field(description="reflectance factor without the specular part", examples=["diffuse.tif"])
+    sunlit: str = Field(description="1 where the sun shines", examples=["sunlit.tif"])
 
 
 LONGEST_NAME = 100

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 from tscorr.config.fields import Section
-from tscorr.config.scenes import SURFACES, VIEWS, Scene
+from tscorr.config.scenes import SURFACES, VIEWS, Scene, Truth
 from tscorr.config.sections import Config
 from tscorr.materials import builtin_materials
 
@@ -68,21 +68,33 @@ def _scene(image: str, class_map: str) -> Iterator[str]:
         "sun": [{"zenith_deg": 40.0, "azimuth_deg": 170.0}],
         "view": _examples(VIEWS),
         "surface": _examples(SURFACES),
+        "truth": [_example(Truth)],
     }
+    more = {"view": VIEWS, "surface": SURFACES}
     yield "[[scenes]]"
     for key, field in Scene.model_fields.items():
         line = _line(key, field, given.get(key, field.default))
         yield line
-        alternatives = (f"{key} = {_toml(example)}" for example in others.get(key, ()))
-        yield from (f"# {other}" for other in alternatives if not line.startswith(other))
+        for example in others.get(key, ()):
+            other = f"{key} = {_toml(example)}"
+            if not line.startswith(other):
+                yield f"# {other}{_also(more[key][example['kind']]) if key in more else ''}"
 
 
 def _examples(kinds: Mapping[str, type[Section]]) -> list[dict[str, Any]]:
-    """One example of each kind, from those of its fields."""
-    return [
-        {"kind": kind, **{key: field.examples[0] for key, field in section.model_fields.items() if field.examples}}
-        for kind, section in kinds.items()
-    ]
+    """One example of each kind."""
+    return [{"kind": kind, **_example(section)} for kind, section in kinds.items()]
+
+
+def _example(section: type[Section]) -> dict[str, Any]:
+    """A table of the examples of its fields."""
+    return {key: field.examples[0] for key, field in section.model_fields.items() if field.examples}
+
+
+def _also(section: type[Section]) -> str:
+    """A remark on the keys that an example of the table does without."""
+    rest = [f"{key} ({field.description})" for key, field in section.model_fields.items() if not field.examples]
+    return f"  # also: {', '.join(rest[1:])}" if len(rest) > 1 else ""  # the first is its kind
 
 
 def _line(key: str, field: FieldInfo, value: Any) -> str:

@@ -64,8 +64,13 @@ def reflectance_scale(fields: Fields) -> float | None:
     return 1 / factor if np.isfinite(factor) and factor > 0 else None
 
 
-def bad_bands(fields: Fields, bands: int) -> tuple[bool, ...]:
-    """Which bands the header marks as bad (0 in `bbl`); empty where it marks none."""
+def bad_bands(fields: Fields, bands: int, path: Path) -> tuple[bool, ...]:
+    """Which bands the header marks as bad (0 in `bbl`); empty where it marks none.
+
+    InputError where it has not one value for each band: that of another image, say.
+    """
+    if fields.get("bbl", "").strip(" {}") and numbers(fields, "bbl", bands) is None:
+        raise InputError(f"{path}: bbl = {fields['bbl']}; allowed is 0 or 1 for each of the {bands} bands")
     bad = tuple(good == 0 for good in numbers(fields, "bbl", bands) or ())
     return bad if any(bad) else ()
 

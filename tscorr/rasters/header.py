@@ -148,7 +148,7 @@ def info_of(dataset: Any, path: Path, *, ours: bool) -> RasterInfo:
         tags=dataset.tags(),
         band_tags=_band_tags(dataset, wavelengths if fields else None, widths if fields else None),
         colors=tuple(dataset.colorinterp),
-        bad_bands=envi.bad_bands(fields, dataset.count),
+        bad_bands=envi.bad_bands(fields, dataset.count, path),
         envi=fields,
         files=(path, *(Path(file) for file in dataset.files[1:])),
         ours=ours,

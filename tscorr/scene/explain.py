@@ -15,6 +15,8 @@ from tscorr.grid import Block, north_of
 from tscorr.scene.plan import Scene
 from tscorr.scene.run import Pipeline
 
+NOT_KNOWN = "not known"
+
 
 def explanation(scene: Scene, row: int, col: int) -> dict[str, dict[str, Any]]:
     """Lines by name, under titles, for a pixel counted from 0; raises InputError outside the image."""
@@ -32,17 +34,19 @@ def explanation(scene: Scene, row: int, col: int) -> dict[str, dict[str, Any]]:
             pipeline.ground.prepare()
             visible = stored.copy()
             bad = pipeline.bad_bands.set_aside(visible)
-            inputs, _ = pipeline.inputs(block, visible, material_rows, np.ones((1, 1), np.bool_))
+            inputs, unseen = pipeline.inputs(block, visible, material_rows, np.ones((1, 1), np.bool_))
             heights = pipeline.ground.surface.heights(block)
         result = pipeline.corrector(inputs, first_row=row)
         pipeline.bad_bands.put_back(result.corrected, bad)
+    seen = unseen is None or not unseen.any()
     lines = {
         "pixel": _pixel(scene, row, col, int(class_value[0, 0]), float(heights[0, 0]))
-        | scene.view.describe(scene.grid, block, heights),
-        "directions (zenith, azimuth from true north)": _directions(scene, block, inputs),
+        | (scene.view.describe(scene.grid, block, heights) if seen else {"seen from": NOT_KNOWN}),
+        "directions (zenith, azimuth from true north)": _directions(scene, block, inputs)
+        | ({} if seen else {"view": NOT_KNOWN}),
     }
     place = int(material_rows[0, 0])
-    if place:
+    if place and seen:
         lines |= _model(scene, inputs, place)
     flags = int(result.flags[0, 0])
     state = SpecularState(int(specular_state(result.flags)[0, 0])).name.lower()
@@ -104,6 +108,7 @@ def _model(scene: Scene, inputs: Any, place: int) -> dict[str, dict[str, Any]]:
         "angles about the facet": {name: f"{float(value):.4f} degrees" for name, value in angles.items()},
         "model": {
             "material": f"{surface.name}, {surface.source}",
+            **({} if rules.enabled else {"enabled": "false: nothing is removed"}),
             "form": rules.form,
             "G": f"{float(reference.attenuation(geometry.cos_i, geometry.cos_r, geometry.cos_l)):.6f}",
             "irradiance plane": f"{rules.irradiance_plane}, factor {plane:.5f}",

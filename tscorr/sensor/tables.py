@@ -13,13 +13,15 @@ Rows = list[tuple[int, dict[str, str]]]
 
 
 def read_columns(path: Path, needed: tuple[str, ...], what: str) -> tuple[Rows, list[str]]:
-    """Rows by column with their line numbers, and the names of all columns.
+    """Rows by column with their line numbers, and the names of all columns, in lower case.
 
+    Cells may be apart by semicolons too, as some spreadsheets write them.
     Raises InputError where the file cannot be read or lacks a column that is needed.
     """
-    reader = csv.DictReader(io.StringIO(read_text(path, what)))
+    text = read_text(path, what)
+    reader = csv.DictReader(io.StringIO(text), delimiter=";" if ";" in text.partition("\n")[0] else ",")
     try:
-        names = [name.strip() for name in reader.fieldnames or []]
+        names = [name.strip().lower() for name in reader.fieldnames or []]
         reader.fieldnames = names
         rows = [(reader.line_num, row) for row in reader]
     except csv.Error as error:
