@@ -222,6 +222,12 @@ def test_across_the_plane_the_horizon_may_come_first():
 # --- wavelengths and forms ----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("wavelength_um", [550, 0.0, float("nan")])
+def test_a_wavelength_in_nanometres_is_refused(wavelength_um):
+    with pytest.raises(MaterialError, match=r"allowed is 0\.1 to 100 um \(550 nm are 0\.55 um\)"):
+        azimuthal_width("roof_tile", 50, wavelength_um=wavelength_um)
+
+
 def test_a_width_is_of_one_wavelength_the_middle_one_by_default():
     tile = material("roof_tile")
     spectral = replace(tile, wavelength_um=(0.4, 0.5, 0.6), w=(0.03, 0.04, 0.05))

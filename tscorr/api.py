@@ -33,7 +33,8 @@ def brdf(
     relative_azimuth_deg : 0 is back-scatter, 180 forward scatter.
     wavelength_um : needed where the material has several wavelengths.
 
-    >>> float(round(brdf("roof_tile", 50, 50, 180)[()], 6))
+    >>> import tscorr
+    >>> float(round(tscorr.brdf("roof_tile", 50, 50, 180)[()], 6))
     0.075591
     """
     known = surface if isinstance(surface, Material) else material(surface)
@@ -123,13 +124,14 @@ def correct(
 
     The sun in the south and the sensor in the north, both at 40 degrees, over a tiled roof and the street beside it:
 
+    >>> import numpy as np, tscorr
     >>> from tscorr.angles import unit_vector
     >>> image = np.full((3, 1, 2), 0.5, np.float32)
     >>> sun, view = unit_vector(40, 180), unit_vector(40, 0)
-    >>> result = correct(image, [[1, 2]], {1: "roof_tile", 2: "lambertian"}, sun, view)
+    >>> result = tscorr.correct(image, [[1, 2]], {1: "roof_tile", 2: "lambertian"}, sun, view)
     >>> result.corrected[0].round(3)
     array([[0.402, 0.5  ]], dtype=float32)
-    >>> specular_state(result.flags)  # corrected, negligible
+    >>> tscorr.specular_state(result.flags)  # corrected, negligible
     array([[1, 0]], dtype=uint16)
     """
     image = np.asarray(_filled(reflectance_factor, nodata))

@@ -125,7 +125,8 @@ def load_materials(path: str | Path) -> dict[str, Material]:
 
     Raises MaterialError where the file is missing, is not TOML, or holds a material that cannot be.
 
-    >>> list(load_materials("samples/delft/materials.toml"))[:2]
+    >>> import tscorr
+    >>> list(tscorr.load_materials("samples/delft/materials.toml"))[:2]
     ['delft_roof_tile', 'delft_red_concrete']
     """
     path = Path(path)
@@ -164,7 +165,8 @@ def find(name: str, library: Mapping[str, Material]) -> Material:
 def material(name: str) -> Material:
     """A material of the built-in library, by name.
 
-    >>> material("roof_tile").w  # 1/degree
+    >>> import tscorr
+    >>> tscorr.material("roof_tile").w  # 1/degree
     (0.0362,)
     """
     return find(name, builtin_materials())

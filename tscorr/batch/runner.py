@@ -36,7 +36,8 @@ def run(
     Raises ConfigError, MaterialError or InputError before any work starts, OutputError where another batch is at work
     in the folder; later errors fail their scene.
 
-    >>> result = run("city.toml")
+    >>> import tscorr
+    >>> result = tscorr.run("city.toml")
     >>> [(scene.name, scene.state) for scene in result.scenes], result.exit_code
     ([('roofs', 'done')], 0)
     """

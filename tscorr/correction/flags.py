@@ -50,7 +50,8 @@ class SpecularState(IntEnum):
 def specular_state(flags: ArrayLike) -> Array:
     """The `SpecularState` of each pixel of a flag layer.
 
-    >>> specular_state(np.array([0, 64, 128 | PixelFlag.SATURATED, 194]))
+    >>> import tscorr
+    >>> tscorr.specular_state([0, 64, 128 | tscorr.PixelFlag.SATURATED, 194])
     array([0, 1, 2, 3])
     """
     values = np.asarray(flags)

@@ -83,8 +83,10 @@ def fit_brdf(
     Raises InputError where the data cannot be fitted: phi reversed, too few samples, a lobe narrower than
     the sampling. What is only doubtful is said in `FitResult.warnings`.
 
+    >>> import numpy as np, tscorr
     >>> incidence, exitance = (angle.ravel() for angle in np.meshgrid([20, 40, 60], np.arange(0, 75, 2.5)))
-    >>> result = fit_brdf(incidence, exitance, 180 + 0 * exitance, brdf("red_concrete", incidence, exitance, 180))
+    >>> measured = tscorr.brdf("red_concrete", incidence, exitance, 180)
+    >>> result = tscorr.fit_brdf(incidence, exitance, 180 + 0 * exitance, measured)
     >>> round(float(result.material.w[0]), 4)
     0.0804
     """

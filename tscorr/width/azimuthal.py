@@ -39,7 +39,8 @@ def azimuthal_width(
     with a normal reflectance above 1/3 might cross the half more than once; then one crossing is found.
     Error: relative 1e-14 (1 + (w D)^2), D half the difference of the angles; more where a width nears 360.
 
-    >>> azimuthal_width("roof_tile", [30, 50, 65]).round(1)
+    >>> import tscorr
+    >>> tscorr.azimuthal_width("roof_tile", [30, 50, 65]).round(1)
     array([185.6,  78.7,  42.3])
     """
     shape, simplified = lobe_shape(m, wavelength_um), is_simplified(form)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tscorr import reference
-from tscorr.errors import ConfigError
-from tscorr.materials import BandParameters, Material, material
+from tscorr.errors import ConfigError, MaterialError
+from tscorr.materials import ALLOWED_WAVELENGTHS, BandParameters, Material, is_wavelength, material
 
 Array = NDArray[np.float64]
 
@@ -57,6 +57,8 @@ def lobe_shape(m: Lobe, wavelength_um: float | None = None) -> LobeShape:
     A LobeShape is handed through. Raises MaterialError where no built-in material has the name, or where the
     material does not cover the wavelength.
     """
+    if wavelength_um is not None and not is_wavelength(wavelength_um):
+        raise MaterialError(f"wavelength_um = {wavelength_um!r}; allowed is {ALLOWED_WAVELENGTHS}")
     if isinstance(m, LobeShape):
         return m
     if not isinstance(m, Material):
