@@ -183,6 +183,13 @@ def test_masked_pixels_have_no_data():
     assert tscorr.correct(counts, CLASSES, TILE, *PEAK, scale=1e-4, nodata=0).corrected[0, 0, 1] == 0
 
 
+@pytest.mark.parametrize("nodata", [-9999, 70000, 1.5, float("nan")])
+def test_nodata_of_masked_integers_must_be_one(nodata):
+    masked = np.ma.masked_greater((IMAGE * 1e4).astype(np.uint16), 1)
+    with pytest.raises(InputError, match=r"nodata = .*; allowed is a value that uint16 can hold"):
+        tscorr.correct(masked, CLASSES, TILE, *PEAK, nodata=nodata, scale=1e-4)
+
+
 def test_masked_classes_are_no_material():
     classes = np.ma.masked_array(CLASSES, mask=CLASSES == 0)
     classes[1, 2] = np.ma.masked

@@ -212,6 +212,11 @@ def _filled(image: Any, nodata: float | None) -> Any:
         return image
     if image.dtype.kind != "f" and nodata is None:
         raise InputError(f"an image of {image.dtype} has masked values; give the nodata that stands for them")
+    if (
+        image.dtype.kind != "f"
+        and not Stored(dtype=image.dtype, scale=(1.0,), offset=(0.0,), nodata=nodata).has_nodata
+    ):
+        raise InputError(f"nodata = {nodata!r}; allowed is a value that {image.dtype} can hold")
     return image.filled(np.nan if image.dtype.kind == "f" else nodata)
 
 

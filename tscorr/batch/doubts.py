@@ -21,7 +21,7 @@ YEARS = 1900, 2100
 def warn(planned: Sequence[Scene]) -> None:
     """Say what is doubtful about scenes."""
     _of_missing_scales(planned)
-    kinds = {(s.image.dtype, s.stored.scale, s.stored.offset, s.stored.saturation): s for s in planned}
+    kinds = {(s.image.dtype, s.stored.scale, s.stored.offset, s.stored.saturation): s for s in reversed(planned)}
     for scene in kinds.values():
         _of_values(scene)  # one image of each kind: what is wrong with it mostly is with all
     for scene in planned:
@@ -70,8 +70,8 @@ def _of_values(scene: Scene) -> None:
         return
     if stored.saturation is not None and middle >= stored.saturation[0]:
         log.warning(
-            "half of the image %s is saturated, with stored values of %g and more: saturation is one of them, not a "
-            "reflectance factor",
+            "half of the middle of the image %s is saturated, with stored values of %g and more: saturation is one of "
+            "them, not a reflectance factor",
             image.path,
             stored.saturation[0],
         )
@@ -87,8 +87,10 @@ def _of_values(scene: Scene) -> None:
 
 def _of_coverage(scene: Scene) -> None:
     """A surface model or a class map of a part of the image."""
+    found_here = isinstance(scene.settings.surface, config.DsmSettings)  # the normals
+    level = "is taken to be level, and flagged NORMAL_UNRELIABLE" if found_here else "shows no cast shadows"
     for raster, name, rest in (
-        (scene.heights_file, "surface model", "is taken to be level, and flagged NORMAL_UNRELIABLE"),
+        (scene.heights_file, "surface model", level),
         (scene.class_map, "class map", "has no material"),
     ):
         share = 1.0 if raster is None else rasters.covered_share(raster, scene.image)

@@ -42,12 +42,28 @@ def write_overview(settings: config.Config, result: BatchResult, planned: Sequen
     try:
         write_whole(result.folder / "batch.json", json.dumps(batch, indent=1) + "\n")
         write_whole(result.folder / "index.html", page)
-        items = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(result.folder.glob("*/item.json"))]
+        items = _items(result.folder)
         if items:
             collected = stac.collection(title=settings.title or "tscorr", items=items)
             write_whole(result.folder / "collection.json", json.dumps(collected, indent=1) + "\n")
     except OSError as error:
         log.warning("the overview in %s could not be written: %s", result.folder, error)
+
+
+def _items(folder: Path) -> list[dict[str, Any]]:
+    """The STAC items of the results in a folder; what else lies there is left alone."""
+    found = [_read(path) for path in sorted(folder.glob("*/item.json")) if read_manifest(path.parent) is not None]
+    return [item for item in found if item is not None]
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """The content of a JSON file of a result; None where somebody damaged it."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        log.warning("%s cannot be read, and is left out of the overview: %s", path, error)
+        return None
+    return content if isinstance(content, dict) else None
 
 
 def _key(folder: Path) -> str | None:
@@ -64,11 +80,9 @@ def _lines(settings: config.Config, result: BatchResult) -> list[SceneLine]:
     ]
     known = {scene.name for scene in result.scenes}
     for name in (str(scene.name) for scene in settings.scenes):
-        report = result.folder / name / "report.json"
-        if name not in known and report.exists():
-            lines.append(
-                SceneLine(name, "earlier", name, report=_brief(json.loads(report.read_text(encoding="utf-8"))))
-            )
+        path = result.folder / name / "report.json"
+        if name not in known and path.exists() and (report := _read(path)) is not None:
+            lines.append(SceneLine(name, "earlier", name, report=_brief(report)))
     return lines
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @config_argument
 @click.option("--scene", "scenes", multiple=True, metavar="NAME", help="Only this scene; may be repeated.")
 @click.option("--material", "materials", multiple=True, metavar="NAME", help="Correct only this material.")
-@click.option("--workers", type=click.IntRange(0, 256), help="Threads; 0 for all cores.")
+@click.option("--workers", type=click.IntRange(0, 256), help="Threads; 0 for as many as there are cores, up to 4.")
 @click.option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster that does the work: tcp://host:port.")
 @click.option("--overwrite", is_flag=True, help="Recompute scenes whose result is current.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress and no table.")

@@ -121,7 +121,7 @@ class MaterialSettings(Section):
 class Run(Section):
     """[run]: how the machine is used."""
 
-    workers: Annotated[Whole, Field(ge=0, le=256)] = Field(0, description="0: all cores")
+    workers: Annotated[Whole, Field(ge=0, le=256)] = Field(0, description="0: as many as there are cores, up to 4")
     memory_limit_mb: Annotated[Whole, Field(ge=128)] = Field(450, description="bound on the memory of a scene")
     skip: Switch = Field(True, description="false computes everything: for checking")
     scheduler: str | None = Field(

@@ -109,7 +109,7 @@ class Means:
         self, fine: tuple[int, int], coarse: tuple[int, int], layers: int, counted: int | None = None
     ) -> None:
         self.cells = Cells(fine, coarse)
-        self._total = np.zeros((layers, *coarse), np.float32)  # exact to 16 million, whatever the order
+        self._total = np.zeros((layers, *coarse), np.float32)  # of integers exact to 16 million, whatever the order
         self._count = np.zeros((counted or layers, *coarse), np.float32)
         self._lock = threading.Lock()
 

@@ -27,6 +27,7 @@ class Reader:
     resampling : how values are found on another grid.
     fill       : value outside the raster, and of nodata where `fill` is nan.
     margin     : pixels beyond the grid that a block may reach.
+    scaled     : values are those that the file's scale and offset make of the stored ones; `fill` is nan then.
     """
 
     def __init__(
@@ -37,12 +38,15 @@ class Reader:
         resampling: Resampling = Resampling.nearest,
         fill: float = 0,
         margin: int = 0,
+        scaled: bool = False,
     ) -> None:
         self.info = info
         self._grid = grid or info.grid
         self._resampling = resampling
         self.fill = fill
         self._margin = margin
+        scale, offset = info.scales[0], info.offsets[0]
+        self._meaning = (np.float32(scale), np.float32(offset)) if scaled and (scale, offset) != (1, 0) else None
         shift = _pixel_shift(info.grid, self._grid)
         self._aligned = shift is not None
         self.shift = shift if shift is not None else (margin, margin)
@@ -54,9 +58,10 @@ class Reader:
         self._lock = threading.Lock()
 
     def read(self, block: Block, bands: int | Sequence[int] | None = None) -> Array:
-        """Stored values of a block: (bands, rows, cols) of all or some bands, or (rows, cols) of one; from 1 on."""
+        """Values of a block: (bands, rows, cols) of all or some bands, or (rows, cols) of one; from 1 on."""
         try:
-            return self._read(block, bands)
+            with np.errstate(over="ignore"):  # what float32 cannot hold is no number
+                return self._read(block, bands)
         except GDAL_ERRORS as error:
             place = f"rows {block.row} to {block.row + block.height}, columns {block.col} to {block.col + block.width}"
             raise InputError(
@@ -83,6 +88,9 @@ class Reader:
             values[~np.isfinite(values)] = np.nan
             if self.info.nodata is not None:
                 values[values == np.float32(self.info.nodata)] = np.nan
+            if self._meaning is not None:
+                scale, offset = self._meaning
+                values = values * scale + offset
         return values
 
     def _pixels(self, dataset: Any, inside: Block, bands: int | Sequence[int] | None) -> Array:

@@ -82,7 +82,7 @@ class Ground:
         if info is None:
             return None
         reader = rasters.Reader(
-            info, self._scene.grid, resampling=Resampling.bilinear, fill=float("nan"), margin=MARGIN_PX
+            info, self._scene.grid, resampling=Resampling.bilinear, fill=float("nan"), margin=MARGIN_PX, scaled=True
         )
         return self._files.enter_context(reader)
 
@@ -113,7 +113,7 @@ class Ground:
         if self._heights is not None and self._shared_heights is not None:
             cell_x_m, cell_y_m = self._scene.grid.cell_size
             by_planes = isinstance(settings, config.DsmSettings) and settings.kind == "roof_planes"
-            survey = HeightSurvey(self._heights, self._scene.image.shape)
+            survey = HeightSurvey(self._heights, self._scene.image.shape, self._scene.ground_level_m)
             kind = RoofPlaneSurface if by_planes else DsmSurface
             dsm = kind(self._shared_heights, survey, cell_x_m=cell_x_m, cell_y_m=cell_y_m)
         if isinstance(settings, config.DsmSettings):
@@ -141,6 +141,8 @@ class Ground:
         """
         if not self.is_swept:
             return
+        if masks is not None and not masks.is_dir():
+            raise OutputError(f"the masks of shadows in {masks} are gone; run again")
         if masks is not None:
             self._lit, self._seen = (self._loaded(masks / name) for name in (LIT, SEEN))
             if (masks / RELIEF).exists():

@@ -273,6 +273,11 @@ def _class_map(
                 f"[materials.classes] has the class {value}, but the class map {class_map.path} holds "
                 f"{class_map.dtype} values; allowed are {limits.min} to {limits.max}"
             )
+    if len(whole.materials.classes) > limits.max - limits.min:
+        raise ConfigError(
+            f"[materials.classes] names every {class_map.dtype} value that the class map {class_map.path} can hold; "
+            f"allowed is one less, so that one can stand for no class"
+        )
     if class_map.nodata in whole.materials.classes:
         raise InputError(
             f"the class map {class_map.path} has the nodata value {class_map.nodata:g}, which is also a class of "
@@ -348,7 +353,8 @@ def _heights(settings: Any, files: tuple[rasters.RasterInfo, ...]) -> tuple[floa
 def _coarse_heights(path: Path, version: tuple[int, int]) -> tuple[float, float]:
     """Middle and highest height of one version of a file: its size and time of change. [m]"""
     del version
-    heights = rasters.read_samples(rasters.describe(path), HEIGHT_WINDOWS, HEIGHT_WINDOW_PX)
+    dsm = rasters.describe(path)
+    heights = rasters.read_samples(dsm, HEIGHT_WINDOWS, HEIGHT_WINDOW_PX) * dsm.scales[0] + dsm.offsets[0]
     if not heights.size:
         raise InputError(f"the surface model {path} holds no heights at all")
     return float(np.median(heights)), float(heights.max())

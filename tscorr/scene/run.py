@@ -76,6 +76,7 @@ class Pipeline:
         self.sums = Sums(len(scene.materials), scene.image.bands)
         self.lights = Lights.of(scene) if strip is None else None
         """before and after, gathered for the picture"""
+        self.writers: dict[str, rasters.Writer | rasters.EnviWriter] = {}
         self.written: dict[str, rasters.RasterInfo] = {}
         """the rasters by product, once they are whole"""
         self._skipping = Skipping(scene, self.corrector.peaks)
@@ -101,9 +102,10 @@ class Pipeline:
                 files.enter_context(self.corrector.compiled_ahead(self._one_pixel))
             with self.sums.timed("geometry"):
                 self._prepare()
-            self.writers = {name: writer_of(scene, self.folder, name, self._strip) for name in sorted(self._products)}
-            self._stored = self._stored_tiles(files)
             try:
+                for name in sorted(self._products):
+                    self.writers[name] = writer_of(scene, self.folder, name, self._strip)
+                self._stored = self._stored_tiles(files)
                 run_all(self.block, units_of(scene, self._strip), workers_of(scene), progress)
             except BaseException:
                 for writer in self.writers.values():
@@ -170,7 +172,7 @@ class Pipeline:
             layers = self._idle_layers(block)
         if self.lights is not None and before is not None:
             after = before if dark or idle is not None else self.lights.of_block(block, result.corrected)
-            self.lights.add(block, before, after)
+            self.lights.add(block, before, after or before)
         if bad is not None:
             self.bad_bands.put_back(result.corrected, bad)
         layers |= {"flags": result.flags[None]}
@@ -238,7 +240,8 @@ class Pipeline:
             for line in tallied(block, self.scene.tally_stride):
                 window = slice(line.row - block.row, line.row - block.row + line.height)
                 here = rows[window]
-                inputs, _ = self.inputs(line, image[:, window], here, self.corrector.peaks[here])
+                lines = np.ascontiguousarray(image[:, window])  # for another layout numba would compile again
+                inputs, _ = self.inputs(line, lines, here, self.corrector.peaks[here])
                 tally = self.corrector(inputs, first_row=line.row, want_removed=False).tally
                 add_angles(result.tally, tally)
         return result

@@ -11,6 +11,7 @@ Each step may be done twice, at the same time too, or be killed: what was done i
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Mapping
 from contextlib import closing
@@ -83,10 +84,9 @@ def hidden_prefix(scene: Scene) -> str:
 
 def clear(scene: Scene, keep: Path | None = None) -> None:
     """Delete the strips of a scene, but for those in the folder to keep."""
-    prefix, parent = hidden_prefix(scene), target_of(scene).parent
-    found = [path for path in parent.glob(f".*{HIDDEN_SUFFIX}") if path.name.startswith(prefix)]
-    for folder in found:
-        if folder != keep:
+    own = re.compile(re.escape(hidden_prefix(scene)) + rf"[^.]*{re.escape(HIDDEN_SUFFIX)}")  # not of `name.2`
+    for folder in target_of(scene).parent.glob(f".*{HIDDEN_SUFFIX}"):
+        if folder != keep and own.fullmatch(folder.name):
             shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -93,7 +93,9 @@ def _surface(scene: Scene, window: Block, files: ExitStack) -> tuple[Array, Arra
     if info is None:
         return heights, up
     margin = SMOOTH_PX // 2 + 1
-    reader = rasters.Reader(info, scene.grid, resampling=Resampling.bilinear, fill=float("nan"), margin=margin)
+    reader = rasters.Reader(
+        info, scene.grid, resampling=Resampling.bilinear, fill=float("nan"), margin=margin, scaled=True
+    )
     around = files.enter_context(reader).read(window.padded(margin), 1).astype(float)
     around = np.where(np.isnan(around), scene.ground_level_m, around)
     smooth = np.lib.stride_tricks.sliding_window_view(around, (SMOOTH_PX, SMOOTH_PX)).mean(axis=(2, 3))

@@ -36,14 +36,14 @@ def residual_glare(scene: Scene, corrected: rasters.RasterInfo) -> dict[str, flo
     ):
         for block in blocks(scene.image.shape, (512, 2048)):
             stored, wanted = image.read(block), true.read(block).astype(float)
-            valid = (light.read(block, 1) == 1) & (stored != scene.stored.nodata).all(axis=0)
+            valid = (light.read(block, 1) == 1) & scene.stored.has_data(stored) & np.isfinite(wanted).all(axis=0)
             if scene.stored.saturation is not None:
                 valid &= (stored < np.array(scene.stored.saturation)[:, None, None]).all(axis=0)
             seen = stored * scale + offset
             specular = seen - wanted
             valid &= (specular > LEAST_SHARE * seen).any(axis=0)
             kept = result.read(block)
-            valid &= (kept != scene.stored.nodata).all(axis=0)  # uncorrectable = "nodata" claims nothing
+            valid &= scene.stored.has_data(kept)  # uncorrectable = "nodata" claims nothing
             left = kept * scale + offset - wanted
             before += float((specular[:, valid] ** 2).sum())
             after += float((left[:, valid] ** 2).sum())
@@ -83,6 +83,7 @@ def coverage(scene: Scene, folder: Path) -> dict[str, Any] | None:
         for block in blocks(scene.image.shape, (512, 2048)):
             wanted = true.read(block).astype(float)
             valid = specular_state(flags.read(block, 1)) == SpecularState.CORRECTED
+            valid &= np.isfinite(wanted).all(axis=0)
             if diffuse.nodata is not None:
                 valid &= (wanted != diffuse.nodata).all(axis=0)
             error = (corrected.read(block) * scale + offset - wanted)[:, valid]
