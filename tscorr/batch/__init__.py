@@ -1,4 +1,4 @@
-"""Many scenes: plan all, then correct one after the other; resume what is done, go on where one fails.
+"""Many scenes: plan all, then correct them, small ones side by side; resume what is done, go on where one fails.
 
 `planning` checks all scenes before work starts, `lock` keeps a second batch out of the output folder, `local` corrects
 the scenes on this machine, `cluster` has the workers of a Dask cluster do the `tasks`, `overview` writes what stands

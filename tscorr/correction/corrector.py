@@ -99,7 +99,7 @@ class _Engine:
 class Corrector:
     """Corrects the blocks of one scene: materials in order, their rules, and the meaning of stored values.
 
-    materials   : name, parameters for each band, allowed angles; row i + 1 of the tables.
+    materials   : each with its parameters for the bands and its rules; row i + 1 of the tables.
     uncertainty : say how sure the results are. What is not asked for is neither computed nor compiled.
     weighted    : the blocks come with weights.
     """
@@ -149,7 +149,7 @@ class Corrector:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether only compiled code looks at directions, and that not where no pixel has a lobe."""
+        """Whether only compiled code looks at directions, which it does only where a pixel has a lobe."""
         return all(engine.precision != "reference" for engine in self._engines)
 
     @property

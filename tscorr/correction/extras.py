@@ -109,7 +109,6 @@ def _row(surface: Material, parameters: BandParameters, rules: Rules, bands: int
         "same_variance": same,
         "sky": sky,
         "has_sky": has_sky,
-        "sky_bound": _sky_bound(sky, beta, steepest),
         "sky_sigma": sky_sigma,
         "reference": direct if adds else np.zeros(bands),
         "reference_sky": back_albedo,
@@ -187,12 +186,6 @@ def _albedo_at(sky: Array, cosine: Array) -> Array:
     """The polynomials of t1 times the albedo (bands, ...) at a cosine: (bands,)."""
     x = cosine * sky[:, -2] + sky[:, -1]
     return np.array([np.polynomial.polynomial.polyval(at, row[:-2]) for at, row in zip(x, sky, strict=True)])
-
-
-def _sky_bound(sky: Array, beta: Array, steepest: float) -> float:
-    """No band's sky part is larger."""
-    cosines = np.sin(np.deg2rad(90 - np.linspace(0, steepest, 50)))
-    return float(1.01 * max(((1 - beta) * _albedo_at(sky, cosine)).max() for cosine in cosines))
 
 
 def check_ratio(surface: Material, wavelengths_um: Sequence[float] | None, bands: int) -> None:

@@ -144,8 +144,6 @@ class Extras(NamedTuple):
     lowest power first, then scale and shift; 0 where the sky's part is left in"""
     has_sky: Any
     """bool (m,): the sky's part is taken away too, also in shadow"""
-    sky_bound: Any
-    """(m,): no band's sky part is larger"""
     sky_sigma: Any
     """relative 1 sigma of the albedo of the lobe"""
     reference: Any
@@ -154,8 +152,8 @@ class Extras(NamedTuple):
     reference_gradient: Any
     """(m, bands, 5): derivatives of ln(t1 f_spec) there by t0, t1, w, n, k"""
     parts: Any
-    """(m, bands, 8): 1 - beta, pi t0 beta, pi t0 (1 - beta), `reference`, `reference_sky`, beta_sigma / beta and
-    beta_sigma where the variance does not hold it already, `sky_sigma`"""
+    """(m, bands, 9): 1 - beta, pi t0 beta, pi t0 (1 - beta), `reference`, `reference_sky`, beta_sigma / beta and
+    beta_sigma where the variance does not hold it already, `sky_sigma`, pi t0 beta_sigma"""
     cross: Any
     """(m, bands, VARIANCE_DEGREE + 3): relative covariance of the lobe and the one at the reference geometry:
     c0 + c1 alpha^2 with a polynomial c0 in cos_l; then c1, and the relative variance of the latter"""

@@ -31,7 +31,7 @@ def explanation(scene: Scene, row: int, col: int) -> dict[str, dict[str, Any]]:
             class_value = pipeline.classes.read(block, 1)
             material_rows = class_rows(class_value, scene.rows)
             stored = pipeline.image.read(block)
-            pipeline.ground.prepare()
+            pipeline.ground.prepare(rows=(row, row + 1))
             visible = stored.copy()
             bad = pipeline.bad_bands.set_aside(visible)
             inputs, unseen = pipeline.inputs(block, visible, material_rows, np.ones((1, 1), np.bool_))
