@@ -24,7 +24,7 @@ from small_scene import (
 
 from tscorr import batch, rasters
 from tscorr.config import load_config
-from tscorr.errors import ConfigError, OutputError
+from tscorr.errors import ConfigError, InputError, OutputError
 from tscorr.scene import run as scene_run
 from tscorr.scene import strips
 from tscorr.scene.survey import HeightSurvey
@@ -49,6 +49,21 @@ def test_scale_and_offset_of_a_surface_model_are_heeded(tmp_path, kind, scale, o
         file.scales, file.offsets = (scale,), (offset,)
     for name, values in plain.items():
         np.testing.assert_array_equal(read_raster(run(config) / f"{name}.tif"), values)
+
+
+@pytest.mark.parametrize(("void", "dtype"), [(-9999, np.float32), (32767, np.int16), (3.4e38, np.float32)])
+def test_heights_that_stand_for_none_must_be_said_to(tmp_path, void, dtype):
+    config = small_scene(tmp_path)
+    values = heights().astype(dtype)
+    values[5:9, 5:9] = void
+    path = write_raster(tmp_path / "dsm.tif", values)
+    with pytest.raises(
+        InputError, match=r"dsm\.tif has a height of .* m; allowed are -1000 to 10000\. If that .*nodata = "
+    ):
+        batch.plan(load_config(config))
+    with rasterio.open(path, "r+") as file:
+        file.nodata = void
+    assert batch.plan(load_config(config))
 
 
 @pytest.mark.parametrize("kind", ["dsm", "roof_planes"])

@@ -26,6 +26,8 @@ T = TypeVar("T")
 Describe = Callable[[str | Path], rasters.RasterInfo]
 """the header of a raster: `rasters.describe`, or one that describes once what the scenes of a batch share"""
 
+LOWEST_M, HIGHEST_M = -1000.0, 10000.0
+"""no ground is, and no roof"""
 HEIGHT_WINDOWS, HEIGHT_WINDOW_PX = 6, 256
 """the coarse look at a large surface model: windows a side, and their side"""
 TALLY_PIXELS = 4e6
@@ -357,4 +359,10 @@ def _coarse_heights(path: Path, version: tuple[int, int]) -> tuple[float, float]
     heights = rasters.read_samples(dsm, HEIGHT_WINDOWS, HEIGHT_WINDOW_PX) * dsm.scales[0] + dsm.offsets[0]
     if not heights.size:
         raise InputError(f"the surface model {path} holds no heights at all")
+    for extreme in (heights.min(), heights.max()):
+        if not LOWEST_M <= extreme <= HIGHEST_M:
+            raise InputError(
+                f"the surface model {path} has a height of {extreme:g} m; allowed are {LOWEST_M:g} to {HIGHEST_M:g}. "
+                f"If that stands for no height, the file must say so: nodata = {extreme:g}"
+            )
     return float(np.median(heights)), float(heights.max())
