@@ -210,14 +210,13 @@ def _filled(image: Any, nodata: float | None) -> Any:
     """Masked values as nan, or of integers as nodata."""
     if not np.ma.is_masked(image):
         return image
-    if image.dtype.kind != "f" and nodata is None:
+    if image.dtype.kind == "f":
+        return image.filled(np.nan)
+    if nodata is None:
         raise InputError(f"an image of {image.dtype} has masked values; give the nodata that stands for them")
-    if (
-        image.dtype.kind != "f"
-        and not Stored(dtype=image.dtype, scale=(1.0,), offset=(0.0,), nodata=nodata).has_nodata
-    ):
+    if not Stored(dtype=image.dtype, scale=(1.0,), offset=(0.0,), nodata=nodata).has_nodata:
         raise InputError(f"nodata = {nodata!r}; allowed is a value that {image.dtype} can hold")
-    return image.filled(np.nan if image.dtype.kind == "f" else nodata)
+    return image.filled(nodata)
 
 
 def _check_places(image: Any, others: Mapping[str, Any]) -> None:

@@ -7,6 +7,11 @@ from tscorr.errors import InputError, TscorrError
 LARGEST_TEXT_BYTES = 100e6
 
 
+def separator(heading: str) -> str:
+    """What stands between the cells of a CSV with this line of names: some spreadsheets write semicolons."""
+    return ";" if ";" in heading else ","
+
+
 def read_text(path: Path, what: str, error: type[TscorrError] = InputError) -> str:
     """The text of a file without a byte order mark; `what` it is and `error` are for messages.
 

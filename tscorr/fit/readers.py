@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tscorr.errors import InputError, nearest
 from tscorr.fit.measurements import Measurements
 from tscorr.materials import ALLOWED_WAVELENGTHS, is_wavelength
-from tscorr.texts import read_text
+from tscorr.texts import read_text, separator
 
 Array = NDArray[np.float64]
 
@@ -66,8 +66,8 @@ def _read_csv(text: str, file: str) -> Measurements:
     ]
     if len(lines) < 2:
         raise InputError(f"{file} has {len(lines)} lines; allowed is a line of column names, then values")
-    separator = ";" if ";" in lines[0][1] else ","
-    parts = [(number, next(csv.reader([line], delimiter=separator))) for number, line in lines]
+    apart = separator(lines[0][1])
+    parts = [(number, next(csv.reader([line], delimiter=apart))) for number, line in lines]
     columns = [_column(heading, file) for heading in parts[0][1]]
     quantity = _checked_columns(columns, file)
     rows = [_numbers(cells, len(columns), f"{file} line {number}") for number, cells in parts[1:]]

@@ -80,7 +80,7 @@ class Cells:
         """Sums (layers, rows, cols) over the pixels that each cell has in a block, of values (layers, rows, cols)."""
         rows, cols = self._starts(block)
         by_row = np.empty((len(values), len(rows), block.width))
-        for i, (top, bottom) in enumerate(zip(rows, [*rows[1:], block.height], strict=True)):
+        for i, (top, bottom) in enumerate(zip(rows, [*rows, block.height][1:], strict=True)):
             np.add.reduce(values[:, top:bottom], axis=1, dtype=float, out=by_row[:, i])
         return np.add.reduceat(by_row, cols, axis=2)
 

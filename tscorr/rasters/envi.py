@@ -69,9 +69,10 @@ def bad_bands(fields: Fields, bands: int, path: Path) -> tuple[bool, ...]:
 
     InputError where it has not one value for each band: that of another image, say.
     """
-    if fields.get("bbl", "").strip(" {}") and numbers(fields, "bbl", bands) is None:
+    marks = numbers(fields, "bbl", bands)
+    if marks is None and fields.get("bbl", "").strip(" {}"):
         raise InputError(f"{path}: bbl = {fields['bbl']}; allowed is 0 or 1 for each of the {bands} bands")
-    bad = tuple(good == 0 for good in numbers(fields, "bbl", bands) or ())
+    bad = tuple(good == 0 for good in marks or ())
     return bad if any(bad) else ()
 
 

@@ -178,7 +178,7 @@ def read_samples(info: RasterInfo, most: int, side: int) -> Array:
         else [(_in_tile(round((length - side) * i / (most - 1)), side, tile), side) for i in range(most)]
         for length, tile in zip(info.shape, info.tile, strict=True)
     ]
-    with Reader(info, fill=float("nan")) as reader:
+    with Reader(info, fill=float("nan"), scaled=True) as reader:
         windows = [Block(row, col, height, width) for row, height in axes[0] for col, width in axes[1]]
         values = np.concatenate([reader.read(window, 1).ravel() for window in windows])
     return values[np.isfinite(values)]

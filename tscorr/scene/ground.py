@@ -43,8 +43,8 @@ STEEPEST_DEG = 80.0
 LIT, SEEN, RELIEF = "lit.bits", "seen.bits", "relief.txt"
 
 
-class _Sweep(NamedTuple):
-    """A sweep that starts so many pixels beyond the image."""
+class _Pass(NamedTuple):
+    """A part of a sweep, which starts so many pixels beyond the image."""
 
     margin: int
     sweep: shadows.Sweep
@@ -60,10 +60,12 @@ class Ground:
         self._scene = scene
         self._folder = folder
         self._files = ExitStack()
-        self._heights = self._heights_reader()
-        self._shared_heights = rasters.KeptReader(self._heights).read if self._heights is not None else None
+        self._heights = scene.heights(MARGIN_PX)
+        self._shared_heights: Callable[[Block], Array] | None = None
         """heights of a block whose surroundings are read for other blocks too; no method of this object: the surface
         holds on to it, and a ring of references keeps its blocks in memory for many scenes more"""
+        if self._heights is not None:
+            self._shared_heights = rasters.KeptReader(self._files.enter_context(self._heights)).read
         self._lock = threading.Lock()
         self._known_surface: Surface | None = None
         self._relief_m = 0.0
@@ -76,15 +78,6 @@ class Ground:
 
     def __exit__(self, *_: object) -> None:
         self._files.close()
-
-    def _heights_reader(self) -> rasters.Reader | None:
-        info = self._scene.heights_file
-        if info is None:
-            return None
-        reader = rasters.Reader(
-            info, self._scene.grid, resampling=Resampling.bilinear, fill=float("nan"), margin=MARGIN_PX, scaled=True
-        )
-        return self._files.enter_context(reader)
 
     def _read_heights(self, block: Block) -> Array:
         """Heights of a block that is read once, whatever its size."""
@@ -141,24 +134,24 @@ class Ground:
         """
         if not self.is_swept:
             return
-        if masks is not None and not masks.is_dir():
-            raise OutputError(f"the masks of shadows in {masks} are gone; run again")
         if masks is not None:
+            if not masks.is_dir():
+                raise OutputError(f"the masks of shadows in {masks} are gone; run again")
             self._lit, self._seen = (self._loaded(masks / name) for name in (LIT, SEEN))
             if (masks / RELIEF).exists():
                 self._relief_m = float((masks / RELIEF).read_text(encoding="ascii"))
             return
         self._rows = rows
-        of_sun, of_view = self._sweep_of_sun(), self._sweep_of_view()
+        of_sun, of_view = self._passes_of_sun(), self._passes_of_view()
         self._lit = self._new_mask()
-        passes = [(self._lit, of_sun.margin, part) for part in of_sun.sweep.parts()]
+        todo = [(self._lit, each) for each in of_sun]
         if of_view is None:
             self._relief_m = self._relief()
         else:
             self._seen = self._new_mask()
-            passes += [(self._seen, of_view.margin, part) for part in of_view.sweep.parts()]
-        threads = max(1, min(threads_of(self._scene), len(passes)))
-        together([partial(self._pass, *each, STRIP_PIXELS / threads) for each in passes], threads)
+            todo += [(self._seen, each) for each in of_view]
+        threads = max(1, min(threads_of(self._scene), len(todo)))
+        together([partial(self._narrow, mask, each, STRIP_PIXELS / threads) for mask, each in todo], threads)
 
     def _loaded(self, path: Path) -> BitMask | None:
         """A mask that was saved, or None where there is none."""
@@ -173,25 +166,25 @@ class Ground:
                 mask.save(folder / name)
         (folder / RELIEF).write_text(repr(self._relief_m), encoding="ascii")
 
-    def _sweep_of_sun(self) -> "_Sweep":
+    def _passes_of_sun(self) -> list[_Pass]:
         sun = self._scene.sun.center
-        return self._sweep(lambda _, **scene: shadows.DirectionSweep(direction=sun, **scene), _zenith_deg(sun))
+        return self._passes(lambda _, **scene: shadows.DirectionSweep(direction=sun, **scene), _zenith_deg(sun))
 
-    def _sweep_of_view(self) -> "_Sweep | None":
+    def _passes_of_view(self) -> list[_Pass] | None:
         """Where one sweep can tell what the sensor sees; otherwise it is found block by block."""
         view, grid = self._scene.view, self._scene.grid
         if isinstance(view, ConstantView):
             direction = view.vectors(grid, Block(0, 0, 1, 1), np.zeros((1, 1)))[:, 0, 0]
-            return self._sweep(
+            return self._passes(
                 lambda _, **scene: shadows.DirectionSweep(direction=direction, **scene), _zenith_deg(direction)
             )
         if isinstance(view, FrameView):
             position = view.position
-            return self._sweep(
+            return self._passes(
                 lambda local, **scene: shadows.FrameSweep(position=local(position), **scene), self._steepest_deg()
             )
         if isinstance(view, LineView) and (ends := view.straight(grid)) is not None:
-            return self._sweep(
+            return self._passes(
                 lambda local, **scene: shadows.LineSweep(start=local(ends[0]), end=local(ends[1]), **scene),
                 self._steepest_deg(),
             )
@@ -207,8 +200,8 @@ class Ground:
         ]
         return max((zenith for zenith in zeniths if np.isfinite(zenith)), default=0.0)
 
-    def _sweep(self, sweep_of: Callable[..., shadows.Sweep], zenith_deg: float) -> "_Sweep":
-        """A sweep over the image, and over what lies around it and may hide something in it.
+    def _passes(self, sweep_of: Callable[..., shadows.Sweep], zenith_deg: float) -> list[_Pass]:
+        """The parts of a sweep over the image, and over what lies around it and may hide something in it.
 
         sweep_of   : given a function that puts a position into the place of what is swept, and its shape and cells.
         zenith_deg : of the source, at most.
@@ -223,7 +216,8 @@ class Ground:
             return float(position[0] - x0), float(position[1] - y0), float(position[2])
 
         shape = rows + 2 * margin, cols + 2 * margin
-        return _Sweep(margin, sweep_of(local, shape=shape, cell_x_m=cell_x_m, cell_y_m=cell_y_m))
+        sweep = sweep_of(local, shape=shape, cell_x_m=cell_x_m, cell_y_m=cell_y_m)
+        return [_Pass(margin, part) for part in sweep.parts()]
 
     def _new_mask(self) -> BitMask:
         """Where nothing is hidden so far. OutputError where the disk has no room for it."""
@@ -232,11 +226,12 @@ class Ground:
         except OSError as error:
             raise self._no_room(error) from None
 
-    def _pass(self, mask: BitMask, margin: int, sweep: shadows.Sweep, pixels: float, stopped: threading.Event) -> None:
-        """Take out of a mask what a sweep finds hidden, which starts `margin` pixels beyond the image.
+    def _narrow(self, mask: BitMask, each: _Pass, pixels: float, stopped: threading.Event) -> None:
+        """Take out of a mask what a pass finds hidden.
 
         pixels : that are read at a time, at most. OutputError where the disk has no room.
         """
+        margin, sweep = each
         rows, cols = self._scene.image.shape
         longest = max(rows, cols) + 2 * margin
         lines = next((lines for lines in STRIP_ROWS if lines * longest <= pixels), STRIP_ROWS[-1])

@@ -47,14 +47,9 @@ class Lights:
         """None where no picture is asked for, the files are small and soon read again, or too many bands are shown."""
         return cls(scene) if _are_gathered(scene) else None
 
-    def of_block(self, block: Block, image: Array) -> tuple[Array, Array] | None:
-        """Sums over cells of the stored values of a block (bands, rows, cols), and of how many pixels they are.
-
-        None of a block of which no row counts.
-        """
+    def of_block(self, block: Block, image: Array) -> tuple[Array, Array]:
+        """Sums over cells of the stored values of a block (bands, rows, cols), and of how many pixels they are."""
         thin, cells = self._thinned(block), self._before.cells
-        if thin.height == 0:
-            return None
         rows = slice(-block.row % self._stride, None, self._stride)
         values = np.stack([image[band, rows] for band in self._bands])
         valid = self._stored.has_data(values)

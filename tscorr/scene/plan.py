@@ -8,6 +8,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from rasterio.enums import Resampling
 
 from tscorr import config, publish, rasters
 from tscorr.correction import Rules, Stored, check_ratio
@@ -122,6 +123,15 @@ class Scene:
     def heights_file(self) -> rasters.RasterInfo | None:
         """The raster of heights, if the surface has one."""
         return next((info for info in self.surface_files if info.bands == 1), None)
+
+    def heights(self, margin: int) -> rasters.Reader | None:
+        """The heights on the image's grid and so many pixels beyond, nan where void, if the surface has any. [m]"""
+        info = self.heights_file
+        if info is None:
+            return None
+        return rasters.Reader(
+            info, self.grid, resampling=Resampling.bilinear, fill=float("nan"), margin=margin, scaled=True
+        )
 
     def classes(self) -> rasters.Reader:
         """The class map on the image's grid; a value that no material has where it does not reach."""
@@ -355,14 +365,14 @@ def _heights(settings: Any, files: tuple[rasters.RasterInfo, ...]) -> tuple[floa
 def _coarse_heights(path: Path, version: tuple[int, int]) -> tuple[float, float]:
     """Middle and highest height of one version of a file: its size and time of change. [m]"""
     del version
-    dsm = rasters.describe(path)
-    heights = rasters.read_samples(dsm, HEIGHT_WINDOWS, HEIGHT_WINDOW_PX) * dsm.scales[0] + dsm.offsets[0]
+    heights = rasters.read_samples(rasters.describe(path), HEIGHT_WINDOWS, HEIGHT_WINDOW_PX)
     if not heights.size:
         raise InputError(f"the surface model {path} holds no heights at all")
-    for extreme in (heights.min(), heights.max()):
+    lowest, highest = float(heights.min()), float(heights.max())
+    for extreme in (lowest, highest):
         if not LOWEST_M <= extreme <= HIGHEST_M:
             raise InputError(
                 f"the surface model {path} has a height of {extreme:g} m; allowed are {LOWEST_M:g} to {HIGHEST_M:g}. "
                 f"If that stands for no height, the file must say so: nodata = {extreme:g}"
             )
-    return float(np.median(heights)), float(heights.max())
+    return float(np.median(heights)), highest

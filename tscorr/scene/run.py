@@ -90,7 +90,8 @@ class Pipeline:
         self.ground = files.enter_context(Ground(scene, self.folder))
         self._confidence = None
         if scene.confidence is not None:
-            self._confidence = files.enter_context(rasters.Reader(scene.confidence, scene.grid, fill=float("nan")))
+            confidence = rasters.Reader(scene.confidence, scene.grid, fill=float("nan"), scaled=True)
+            self._confidence = files.enter_context(confidence)
 
     def run(self, progress: Progress) -> Sums:
         """All blocks, by the workers of the configuration, and their sums; the first error stops the rest."""
@@ -172,7 +173,7 @@ class Pipeline:
             layers = self._idle_layers(block)
         if self.lights is not None and before is not None:
             after = before if dark or idle is not None else self.lights.of_block(block, result.corrected)
-            self.lights.add(block, before, after or before)
+            self.lights.add(block, before, after)
         if bad is not None:
             self.bad_bands.put_back(result.corrected, bad)
         layers |= {"flags": result.flags[None]}
@@ -302,11 +303,7 @@ class Pipeline:
 
     def _class_confidence(self, block: Block) -> Array | None:
         """How sure the class is, nan where that is not known, or None where nobody says."""
-        if self._confidence is None:
-            return None
-        info = self._confidence.info
-        confidence: Array = self._confidence.read(block, 1) * info.scales[0] + info.offsets[0]
-        return confidence
+        return None if self._confidence is None else self._confidence.read(block, 1)
 
     def _shadowed(
         self,

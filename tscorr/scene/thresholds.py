@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.enums import Resampling
 
 from tscorr import config, rasters, reference
 from tscorr.correction import class_rows
@@ -84,19 +83,15 @@ def _largest(scene: Scene, window: Block) -> Array:
 def _surface(scene: Scene, window: Block, files: ExitStack) -> tuple[Array, Array]:
     """Heights (rows, cols) or (1, 1), and normals (3, rows, cols) or (3, 1, 1), of a window."""
     up = np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1)
-    settings, info = scene.settings.surface, scene.heights_file
+    settings, margin = scene.settings.surface, SMOOTH_PX // 2 + 1
     heights = np.full((1, 1), scene.ground_level_m)
     if isinstance(settings, config.NormalsSettings):
         reader = rasters.Reader(scene.surface_files[-1], scene.grid, fill=float("nan"))
         normal = files.enter_context(reader).read(window).astype(float)
         return heights, np.where(np.isfinite(normal).all(axis=0), normal, up)
-    if info is None:
+    if (surface := scene.heights(margin)) is None:
         return heights, up
-    margin = SMOOTH_PX // 2 + 1
-    reader = rasters.Reader(
-        info, scene.grid, resampling=Resampling.bilinear, fill=float("nan"), margin=margin, scaled=True
-    )
-    around = files.enter_context(reader).read(window.padded(margin), 1).astype(float)
+    around = files.enter_context(surface).read(window.padded(margin), 1).astype(float)
     around = np.where(np.isnan(around), scene.ground_level_m, around)
     smooth = np.lib.stride_tricks.sliding_window_view(around, (SMOOTH_PX, SMOOTH_PX)).mean(axis=(2, 3))
     cell_x_m, cell_y_m = scene.grid.cell_size

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tscorr.errors import InputError
-from tscorr.texts import read_text
+from tscorr.texts import read_text, separator
 
 Rows = list[tuple[int, dict[str, str]]]
 
@@ -19,7 +19,7 @@ def read_columns(path: Path, needed: tuple[str, ...], what: str) -> tuple[Rows, 
     Raises InputError where the file cannot be read or lacks a column that is needed.
     """
     text = read_text(path, what)
-    reader = csv.DictReader(io.StringIO(text), delimiter=";" if ";" in text.partition("\n")[0] else ",")
+    reader = csv.DictReader(io.StringIO(text), delimiter=separator(text.partition("\n")[0]))
     try:
         names = [name.strip().lower() for name in reader.fieldnames or []]
         reader.fieldnames = names
