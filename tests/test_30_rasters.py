@@ -557,18 +557,19 @@ def test_tiles_that_reach_over_the_edge_are_as_gdal_writes_them(tmp_path, compre
             assert after.block_shapes[0] == info.tile
 
 
+@pytest.mark.parametrize("compress", ["zstd", "deflate"])
 @pytest.mark.parametrize("dtype", ["uint8", "int8", "int16", "uint32", "int64", "float32", "float64"])
 @pytest.mark.parametrize("predicted", [False, True])
 @pytest.mark.parametrize("interleave", ["band", "pixel"])
 @pytest.mark.parametrize("cut", ["tiles", "strips"])
-def test_gdal_decodes_what_is_predicted_and_compressed_here(tmp_path, dtype, predicted, interleave, cut):
+def test_gdal_decodes_what_is_predicted_and_compressed_here(tmp_path, compress, dtype, predicted, interleave, cut):
     limits = np.finfo(dtype) if np.dtype(dtype).kind == "f" else np.iinfo(dtype)
     values = np.random.default_rng(14).uniform(-0.4, 0.4, (BANDS, 41, 57)) * float(limits.max) + float(limits.max) / 2
     values = values.astype(dtype)
     values[:, 3, :2] = limits.min, limits.max
     tiles = {} if cut == "tiles" else {"tiled": False, "blockysize": 16}
     predictor = {"predictor": 3 if np.dtype(dtype).kind == "f" else 2} if predicted else {}
-    path = write_raster(tmp_path / "x.tif", values, compress="zstd", interleave=interleave, **tiles, **predictor)
+    path = write_raster(tmp_path / "x.tif", values, compress=compress, interleave=interleave, **tiles, **predictor)
     copy = copied(rasters.describe(path), tmp_path / "copy.tif", (16, 32 if cut == "tiles" else 57))
     with rasterio.open(copy.path) as after:
         np.testing.assert_array_equal(after.read(), values)

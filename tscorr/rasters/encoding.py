@@ -1,11 +1,10 @@
 """Blocks as the bytes of tiles: each is encoded where it was computed, so that threads share the work of a codec."""
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import pairwise, repeat
 from typing import Any, NamedTuple
 
 import numpy as np
-import rasterio
 from affine import Affine
 from numpy.typing import NDArray
 from rasterio.io import MemoryFile
@@ -15,8 +14,8 @@ from tscorr.rasters import tiff
 
 Array = NDArray[Any]
 
-SHARED = ("driver", "count", "dtype", "interleave", "compress", "predictor", "zstd_level", "zlevel")
-"""creation options that decide what the bytes of a tile are"""
+ANYWHERE = Affine.scale(2)
+"""a file without a place is worth a warning to rasterio"""
 
 
 class Tiles(NamedTuple):
@@ -41,74 +40,66 @@ class Tiles(NamedTuple):
 class Encoder:
     """Encodes blocks of whole tiles for one file.
 
-    ZSTD without GDAL, which takes 1.6 times as long for a block, since it copies it four times.
+    Tiles are cut out and predicted here, in one pass, and codecs are given bytes: GDAL, which is asked for those but
+    ZSTD, copies values four times before it encodes them.
 
     options : creation options of the file. layout : how it is cut. tiled : whether into tiles, not strips.
     """
 
-    def __init__(self, options: dict[str, Any], layout: tiff.Layout, *, tiled: bool) -> None:
-        self._options = {key: options[key] for key in SHARED if key in options}
+    def __init__(self, options: Mapping[str, Any], layout: tiff.Layout, *, tiled: bool) -> None:
+        self._codec = options.get("compress") or "none"
+        self._levels = {key: options[key] for key in ("zlevel", "zstd_level") if key in options}
+        self._put = PREDICTED[options.get("predictor", 1)]
         self._layout = layout
         self._tiled = tiled
-        self._codec = options.get("compress") or "none"
 
-    @contextmanager
-    def __call__(self, values: Array) -> Iterator[Tiles]:
-        """The tiles of a block (bands, rows, cols); they last as long as the context."""
-        if self._codec == "none":
-            tiles, sizes = self._arranged(values)
-            yield Tiles(tiff.octets(tiles), np.arange(len(tiles)) * tiles[0].nbytes, sizes)
-            return
+    def __call__(self, values: Array) -> Tiles:
+        """The tiles of a block (bands, rows, cols)."""
         if self._codec == "zstd":
-            yield self._zstd(values)
-            return
-        rows, cols = self._padded(values)
-        cut: dict[str, Any] = {"tiled": False, "blockysize": min(self._layout.tile[0], rows)}
-        if self._tiled:
-            cut = {"tiled": True, "blockysize": self._layout.tile[0], "blockxsize": self._layout.tile[1]}
-        with MemoryFile() as memory:
-            anywhere = Affine.scale(2)  # a file without a place is worth a warning to rasterio
-            with memory.open(**self._options, **cut, height=rows, width=cols, transform=anywhere) as dataset:
-                dataset.write(values, window=rasterio.windows.Window(0, 0, values.shape[2], values.shape[1]))
-            content = memoryview(memory.getbuffer())
-            read = tiff.bytes_of(content)
-            places = tiff.directory(read)
-            offsets, sizes = places.offsets.of(read), places.sizes.of(read)
-            first, last = int(offsets.min()), int((offsets + sizes).max())
-            yield Tiles(content[first:last], offsets - first, sizes)
+            compressor = ZstdCompressor(level=self._levels["zstd_level"])
+            again = repeat(self._empty(values, 1)[0])  # each is compressed while the processor has it at hand
+            parts = [compressor.compress(tile) for tile in self._filled(values, again)]
+            return Tiles.joined(parts, np.array([len(part) for part in parts]))
+        tiles = self._empty(values, len(list(self._cut(values))))
+        sizes = np.array([len(tile) for tile in self._filled(values, tiles)])
+        if self._codec == "none":
+            return Tiles(tiff.octets(tiles), np.arange(len(tiles)) * tiles[0].nbytes, sizes)
+        return self._by_gdal(tiles, sizes)
 
-    def _padded(self, values: Array) -> tuple[int, int]:
-        """Rows and columns of the whole tiles that a block fills; the last strip of a file is never padded."""
-        rows, cols = values.shape[1:]
-        if not self._tiled:
-            return rows, cols
-        tile_rows, tile_cols = self._layout.tile
-        return -(-rows // tile_rows) * tile_rows, -(-cols // tile_cols) * tile_cols
+    def _by_gdal(self, tiles: Array, sizes: Array) -> Tiles:
+        """Tiles (tiles, rows, cols, samples) as GDAL compresses the strips of a file of bytes, as wide as a tile."""
+        row_bytes, parts, coded = tiles[0, 0].nbytes, [], []
+        same = np.flatnonzero(np.diff(sizes, prepend=-1, append=-1))  # the last strip of a file is shorter
+        for first, last in pairwise(same.tolist()):
+            rows = int(sizes[first]) // row_bytes
+            lines = np.ascontiguousarray(tiles[first:last, :rows]).view(np.uint8).reshape(1, -1, row_bytes)
+            shape = {"count": 1, "height": lines.shape[1], "width": row_bytes, "blockysize": rows}
+            with MemoryFile() as memory:
+                with memory.open(
+                    driver="GTiff", dtype="uint8", compress=self._codec, transform=ANYWHERE, **self._levels, **shape
+                ) as dataset:
+                    dataset.write(lines)
+                content = memoryview(memory.getbuffer())
+                read = tiff.bytes_of(content)
+                places = tiff.directory(read)
+                coded.append(places.sizes.of(read))
+                stored = zip(places.offsets.of(read), coded[-1], strict=True)
+                parts.append(b"".join(content[start : start + size] for start, size in stored))
+        return Tiles.joined(parts, np.concatenate(coded))
 
-    def _zstd(self, values: Array) -> Tiles:
-        """Tiles that are predicted and compressed, each at once, as long as the processor has it at hand."""
-        put = PREDICTED[self._options.get("predictor", 1)]
-        compressor = ZstdCompressor(level=self._options["zstd_level"])
-        tile, parts = self._empty(values, 1)[0], []
-        for plane, (top, left), stored in self._cut(values):
+    def _filled(self, values: Array, tiles: Iterable[Array]) -> Iterator[memoryview]:
+        """The bytes to compress of each tile of a block, which is put into the next of the given ones."""
+        for (plane, (top, left), stored), tile in zip(self._cut(values), tiles, strict=False):
             if plane.shape[1] - top < tile.shape[0] or plane.shape[2] - left < tile.shape[1]:
                 tile[:] = 0
-            parts.append(compressor.compress(tiff.octets(put(plane, top, left, tile))[:stored]))
-        return Tiles.joined(parts, np.array([len(part) for part in parts]))
-
-    def _arranged(self, values: Array) -> tuple[Array, Array]:
-        """Tiles (tiles, rows, cols, samples) in the order of the file, and how many bytes of each are stored."""
-        cut = list(self._cut(values))
-        tiles = self._empty(values, len(cut))
-        for tile, (plane, (top, left), _) in zip(tiles, cut, strict=True):
-            _lay(plane, top, left, tile)
-        return tiles, np.array([stored for *_, stored in cut])
+            self._put(plane, top, left, tile)
+            yield tiff.octets(tile)[:stored]
 
     def _empty(self, values: Array, count: int) -> Array:
-        """Tiles (tiles, rows, cols, samples) for a block; zeros where it does not fill all of them."""
-        rows, cols = self._padded(values)
-        shape = min(self._layout.tile[0], rows), self._layout.tile[1], len(values) if self._layout.planes == 1 else 1
-        return (np.empty if values.shape[1:] == (rows, cols) else np.zeros)((count, *shape), values.dtype)
+        """Memory for so many tiles (tiles, rows, cols, samples) of a block."""
+        rows, cols = self._layout.tile
+        rows = rows if self._tiled else min(rows, values.shape[1])
+        return np.empty((count, rows, cols, len(values) if self._layout.planes == 1 else 1), values.dtype)
 
     def _cut(self, values: Array) -> Iterator[tuple[Array, tuple[int, int], int]]:
         """The tiles of a block in the order of the file.
@@ -124,41 +115,39 @@ class Encoder:
                     yield plane, (top, left), rows * tile_cols * len(plane) * values.itemsize
 
 
-def _lay(values: Array, top: int, left: int, tile: Array) -> Array:
+def _put_values(values: Array, top: int, left: int, tile: Array) -> None:
     """The values (samples, rows, cols) from a pixel on in their places of a tile (rows, cols, samples)."""
     rows, cols, samples = tile.shape
     for sample in range(samples):
         part = values[sample, top : top + rows, left : left + cols]
         tile[: part.shape[0], : part.shape[1], sample] = part
-    return tile
 
 
-def _put_differences(values: Array, top: int, left: int, tile: Array) -> Array:
+def _put_differences(values: Array, top: int, left: int, tile: Array) -> None:
     """Predictor 2 of a tile (`set_differences`)."""
     from tscorr.rasters.compiled import set_differences
 
     unsigned = np.dtype(f"u{values.itemsize}")
     set_differences(np.ascontiguousarray(values).view(unsigned), top, left, tile.view(unsigned))
-    return tile
 
 
-def _put_differences_of_bytes(values: Array, top: int, left: int, tile: Array) -> Array:
+def _put_differences_of_bytes(values: Array, top: int, left: int, tile: Array) -> None:
     """Predictor 3: of each row the first bytes of all its numbers, then the second, ..., and differences of all.
 
     The first byte is the one with the sign. Source: TIFF Technical Note 3, "Floating point predictor".
     """
-    rows, cols, samples = _lay(values, top, left, tile).shape
+    _put_values(values, top, left, tile)
+    rows, cols, samples = tile.shape
     octets = tile.astype(tile.dtype.newbyteorder(">")).view(np.uint8).reshape(rows, cols * samples, -1)
     sorted_octets = np.ascontiguousarray(octets.transpose(0, 2, 1)).reshape(rows, -1, samples)
-    found = np.empty_like(sorted_octets)
+    found = tile.view(np.uint8).reshape(sorted_octets.shape)
     found[:, 0] = sorted_octets[:, 0]
     np.subtract(sorted_octets[:, 1:], sorted_octets[:, :-1], out=found[:, 1:])
-    return found
 
 
-PREDICTED: dict[int, Callable[[Array, int, int, Array], Array]] = {
-    1: _lay,
+PREDICTED: dict[int, Callable[[Array, int, int, Array], None]] = {
+    1: _put_values,
     2: _put_differences,
     3: _put_differences_of_bytes,
 }
-"""values (samples, rows, cols) from a pixel on, as what is compressed of a tile (rows, cols, samples)"""
+"""put values (samples, rows, cols) from a pixel on into a tile (rows, cols, samples), as what is compressed of it"""

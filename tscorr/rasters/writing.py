@@ -97,10 +97,10 @@ class Writer:
         if not used.any():
             return
         try:
-            with self._encoder(values) as encoded:
-                self._put(numbers.ravel()[used], encoded if used.all() else encoded.of(used))
+            encoded = self._encoder(values)
         except RasterioError as error:
             raise OutputError(f"{self.path} cannot be written: {error}") from None
+        self._put(numbers.ravel()[used], encoded if used.all() else encoded.of(used))
         with self._lock:
             if self._sample is None:
                 tile = self._first_tile(block)
