@@ -259,6 +259,32 @@ def test_a_unit_wholly_in_cast_shadow_is_counted(tmp_path):
     assert with_and_without(tmp_path, {}, **METAL_ONLY)["blocks_shadow_or_nodata"] == 1
 
 
+@pytest.mark.parametrize("confidence", [None, "confidence.tif"])
+@pytest.mark.parametrize("output", [{}, {"corrected": "vrt"}, {"corrected": "vrt", "format": "cog"}], ids=str)
+def test_of_a_unit_without_specular_material_the_class_map_tells_flags_and_sums(tmp_path, output, confidence):
+    write_inputs(tmp_path)
+    write_image(tmp_path / "image.tif", image_values(np.uint16), nodata=None)
+    classes = np.where(class_map() == METAL, GROUND, class_map())  # tiles and a corner that no class names are left
+    write_raster(tmp_path / "class_map.tif", classes)
+    write_raster(tmp_path / "confidence.tif", np.linspace(0, 1, classes.size, dtype=np.float32).reshape(SHAPE))
+    found = []
+    for skip in (True, False):
+        sections = {"output": {"directory": "out", "quicklook": False, **output}, "run": {"skip": skip}}
+        (scene,) = batch.run(
+            write_config(tmp_path, {"class_confidence": confidence}, **sections, **METAL_ONLY), overwrite=True
+        ).scenes
+        assert scene.error == ""
+        found.append((scene.report, read_raster(scene.folder / "flags.tif")[0]))
+    (skipped, flags), (whole, expected) = found
+    np.testing.assert_array_equal(flags, expected)
+    unknown = classes != GROUND
+    assert (flags[unknown] != 0).all()
+    assert (flags[~unknown] == 0).all() == (confidence is None)
+    assert skipped["skipped"]["blocks_no_specular_material"] == 1
+    for key in ("pixels", "materials"):
+        assert skipped[key] == whole[key], key
+
+
 def random_scene(folder, seed):
     """A scene of random classes, image, directions and rules: the keys of its configuration."""
     rng = np.random.default_rng(seed)

@@ -1,6 +1,6 @@
 """The specular peak taken out of a block of an image: pure arrays in, arrays and flags out."""
 
-from tscorr.correction.corrector import BlockInputs, BlockResult, Corrector, class_rows
+from tscorr.correction.corrector import UNKNOWN_MATERIAL, BlockInputs, BlockResult, Corrector, class_rows, flags_of
 from tscorr.correction.extras import check_ratio, is_extra
 from tscorr.correction.flags import FLAG_VALUES, SINGLE_FLAGS, PixelFlag, SpecularState, specular_state
 from tscorr.correction.rules import NEGLIGIBLE_REFLECTANCE, ReferenceDirections, Rules, Stored
@@ -10,6 +10,7 @@ __all__ = [
     "FLAG_VALUES",
     "NEGLIGIBLE_REFLECTANCE",
     "SINGLE_FLAGS",
+    "UNKNOWN_MATERIAL",
     "BlockInputs",
     "BlockResult",
     "Corrector",
@@ -23,6 +24,7 @@ __all__ = [
     "add_tally",
     "check_ratio",
     "class_rows",
+    "flags_of",
     "is_extra",
     "new_tally",
     "specular_state",

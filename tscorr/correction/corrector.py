@@ -177,21 +177,21 @@ class Corrector:
         """
         results = self._results(inputs, everywhere=inputs.image.shape, want_removed=False)
         if len(inputs.image) == 0 and inputs.low_confidence is None:
-            self._set_states(inputs.material, results)
+            flags = flags_of(inputs.material)
+            counts = [np.count_nonzero(inputs.material == row) for row in range(len(self.names) + 1)]
+            results = replace(results, flags=flags, tally=self.tally_of(np.array(counts)))
         else:
             idle = replace(self._engines[0], table=self._engines[0].table._replace(peak=np.zeros_like(self.peaks)))
             self._run(idle, inputs, results, 0)
         return self._result(inputs, results, want_removed=False)
 
-    def _set_states(self, material: Array, results: "_Results") -> None:
-        """The flags of a block that follow from its materials alone: negligible, or none that is known."""
-        unknown = material == 0
-        without = np.count_nonzero(unknown)
-        if without > 0:
-            results.flags[unknown] = UNKNOWN_MATERIAL
-        results.tally.states[0, SpecularState.NOT_ASSESSED] = without
-        for row in range(1, len(results.tally.states)):
-            results.tally.states[row, SpecularState.NEGLIGIBLE] = np.count_nonzero(material == row)
+    def tally_of(self, counts: Array) -> kernels.Tally:
+        """The sums of a block of which nothing is to be removed, with so many pixels of each row."""
+        tally = new_tally(len(self.names) + 1, len(self.stored.scale))
+        tally.states[:, SpecularState.NEGLIGIBLE] = counts
+        tally.states[0] = 0
+        tally.states[0, SpecularState.NOT_ASSESSED] = counts[0]
+        return tally
 
     def __call__(self, inputs: BlockInputs, *, first_row: int = 0, want_removed: bool = True) -> BlockResult:
         """The block without its specular part; `inputs.image` is changed in place."""
@@ -293,6 +293,11 @@ def _vectors(values: Array, precision: str) -> Array:
     """Contiguous vectors; those in float32 are widened where they are read, by compiled code alone."""
     as_they_are = values.dtype == np.float32 and precision != "reference"
     return np.ascontiguousarray(values, None if as_they_are else np.float64)
+
+
+def flags_of(material: Array) -> Array:
+    """The flags of a block of which nothing is to be removed, by the corrector's row of each pixel: uint16."""
+    return np.where(material == 0, np.uint16(UNKNOWN_MATERIAL), np.uint16(0))
 
 
 def looked_up(values: Array, table: bytes) -> Array:

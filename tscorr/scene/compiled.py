@@ -7,7 +7,7 @@ from tscorr.loops import LOOP
 
 @njit(**LOOP)
 def count_values(flags, counts):
-    """Add to `counts`, int64 (FLAG_VALUES,), the pixels with each value of uint16 flags (rows, cols)."""
+    """Add to `counts`, int64, the pixels with each value of flags or classes: unsigned integers (rows, cols)."""
     for i in range(flags.shape[0]):
         value, run = flags[i, 0], 0
         for j in range(flags.shape[1]):  # values stand in runs: they are counted without the memory

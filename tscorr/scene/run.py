@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tscorr import rasters
-from tscorr.correction import BlockInputs, BlockResult, Corrector, add_angles, class_rows
+from tscorr.correction import BlockInputs, BlockResult, Corrector, add_angles, class_rows, flags_of
 from tscorr.correction.edges import ShadowByBrightness
 from tscorr.grid import Block
 from tscorr.scene import memory
@@ -22,7 +22,7 @@ from tscorr.scene.ground import Ground
 from tscorr.scene.pictures import Lights
 from tscorr.scene.plan import Scene
 from tscorr.scene.products import write_corrected_vrt, writer_of, written_products
-from tscorr.scene.skipping import SHADOW_OR_NODATA, Idle, Skipping, tallied
+from tscorr.scene.skipping import NO_SPECULAR_MATERIAL, SHADOW_OR_NODATA, Idle, Skipping, tallied
 from tscorr.scene.sums import Sums
 from tscorr.scene.threads import together
 
@@ -151,9 +151,32 @@ class Pipeline:
     def block(self, block: Block) -> int:
         """Read, correct and write one block; the number of its pixels."""
         with self.sums.timed("read"):
-            rows = class_rows(self.classes.read(block, 1), self.scene.rows)
-            stored = self._stored if self._stored is not None and self._stored.holds(block) else None
-            unread = (self._as_difference or stored is not None) and not self._image_is_needed
+            classes = self.classes.read(block, 1)
+        stored = self._stored if self._stored is not None and self._stored.holds(block) else None
+        unread = (self._as_difference or stored is not None) and not self._image_is_needed
+        counts = self._skipping.idle_pixels(classes) if unread and self._confidence is None else None
+        if counts is not None:
+            self._pass_by(block, classes, counts, stored)
+        else:
+            self._work_on(block, class_rows(classes, self.scene.rows), stored, unread=unread)
+        memory.keep_below(self.scene.config.run.memory_limit_mb)
+        return classes.size
+
+    def _pass_by(self, block: Block, classes: Array, counts: Array, stored: rasters.StoredTiles | None) -> None:
+        """Write a block of which no more need be known than how many pixels have which row of the corrector."""
+        layers = self._idle_layers(block)
+        if counts[0] > 0:
+            layers["flags"] = flags_of(class_rows(classes, self.scene.rows))[None]
+        with self.sums.timed("write"):
+            self._write(block, layers, stored)
+        self.sums.add_idle(self.corrector.tally_of(counts), NO_SPECULAR_MATERIAL)
+
+    def _work_on(self, block: Block, rows: Array, stored: rasters.StoredTiles | None, *, unread: bool) -> None:
+        """Look at a block of these rows of the corrector closely: read, correct and write it.
+
+        stored : holds it, unless that is None. unread : the image is read only where that turns out to be needed.
+        """
+        with self.sums.timed("read"):
             image, bad = (None, None) if unread else self._read_image(block)
         needed = self.corrector.have_peaks(rows)
         with self.sums.timed("geometry"):
@@ -188,8 +211,6 @@ class Pipeline:
         with self.sums.timed("write"):
             self._write(block, layers, stored)
         self.sums.add(result, rows, SHADOW_OR_NODATA if dark else None if idle is None else idle.reason)
-        memory.keep_below(self.scene.config.run.memory_limit_mb)
-        return rows.size
 
     @property
     def _image_is_needed(self) -> bool:

@@ -13,6 +13,7 @@ from tscorr.correction import class_rows
 from tscorr.grid import Block, blocks
 from tscorr.scene.plan import Scene
 from tscorr.scene.reach import Reach
+from tscorr.scene.sums import counted
 
 Array = NDArray[Any]
 
@@ -77,6 +78,19 @@ class Skipping:
             if attenuated is not None:
                 return Idle(OUT_OF_REACH, attenuated)
         return None
+
+    def idle_pixels(self, classes: Array) -> Array | None:
+        """Pixels of each row of the corrector in a block of the class map, if that is all that has to be known of it.
+
+        None where that is not so, or not told as quickly.
+        """
+        if not self._on or self._wants_angles or self.flags_need_image or classes.dtype != np.uint8:
+            return None
+        found, counts = counted(classes, 256), np.zeros(len(self._peaks), np.int64)
+        for value, row in self._scene.rows.items():
+            counts[row] += found[value] if 0 <= value < len(found) else 0
+        counts[0] += found.sum() - counts.sum()
+        return None if counts[self._peaks].any() else counts
 
     def is_dark(self, needed: Array, shade: tuple[Array, Array] | None) -> bool:
         """Whether the needed pixels lie in cast shadow, all of them and for certain: then no lobe is evaluated."""

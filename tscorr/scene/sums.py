@@ -9,10 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tscorr.correction import FLAG_VALUES, SINGLE_FLAGS, BlockResult, add_tally, new_tally
+from tscorr.correction import FLAG_VALUES, SINGLE_FLAGS, UNKNOWN_MATERIAL, BlockResult, add_tally, new_tally
 from tscorr.correction.sigmas import SigmaTally
+from tscorr.kernels import Tally
 
 Array = NDArray[Any]
+
+
+def counted(values: Array, size: int) -> Array:
+    """How often each of so many values stands in an array (rows, cols) of unsigned integers."""
+    from tscorr.scene.compiled import count_values
+
+    counts = np.zeros(size, np.int64)
+    count_values(values, counts)
+    return counts
 
 
 class Sums:
@@ -33,21 +43,29 @@ class Sums:
 
     def add(self, result: BlockResult, rows: Array, kind: str | None) -> None:
         """Add a block of these rows of the corrector; `kind` says why most of its work was skipped, if it was."""
-        from tscorr.scene.compiled import count_values
-
-        counts, sigmas = np.zeros_like(self.flags), None
-        count_values(result.flags, counts)
+        counts, sigmas = counted(result.flags, FLAG_VALUES), None
         if result.sigma is not None:
             sigmas = SigmaTally(len(self.sigmas.touched))
             sigmas.add(result.sigma, result.flags, rows)
         with self._lock:
-            add_tally(self.tally, result.tally)
-            self.flags += counts
+            self._add(result.tally, counts, kind)
             for name, values in ({} if sigmas is None else sigmas.arrays).items():
                 self.sigmas.arrays[name] += values
-            self.skipped["blocks"] += 1
-            if kind is not None:
-                self.skipped[kind] += 1
+
+    def add_idle(self, tally: Tally, kind: str) -> None:
+        """Add a block of which nothing is to be removed, of whose flags no more is known than what the tally tells."""
+        counts = np.zeros_like(self.flags)
+        unknown = tally.states[0].sum()
+        counts[UNKNOWN_MATERIAL], counts[0] = unknown, tally.states.sum() - unknown
+        with self._lock:
+            self._add(tally, counts, kind)
+
+    def _add(self, tally: Tally, flags: Array, kind: str | None) -> None:
+        add_tally(self.tally, tally)
+        self.flags += flags
+        self.skipped["blocks"] += 1
+        if kind is not None:
+            self.skipped[kind] += 1
 
     def flag_counts(self) -> dict[str, int]:
         """Pixels with each flag, by name."""
