@@ -26,7 +26,7 @@ SEALED = ',\n "manifest_sha256": "'
 """stands before the hash that ends a manifest"""
 HASHES: dict[str, Callable[[], Any]] = {"blake3": blake3, "sha256": hashlib.sha256}
 """of files, by the name that stands in the manifest; BLAKE3 takes a third of the time of SHA-256"""
-READ_BYTES = 1 << 20
+READ_BYTES = 2 << 20
 HIDDEN = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>part|old)")
 """names of what is being made and of what is being replaced"""
 UNFINISHED = re.compile(r"\..+\.(?:part|old|strips)")
