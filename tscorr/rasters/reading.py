@@ -11,8 +11,10 @@ from rasterio.vrt import WarpedVRT
 
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
+from tscorr.rasters.decoding import Decoder, tiles_of
 from tscorr.rasters.header import RasterInfo, environment, opened, reason_of
 from tscorr.rasters.sound import GDAL_ERRORS, open_dataset
+from tscorr.rasters.stored_tiles import StoredTiles
 
 Array = NDArray[Any]
 
@@ -55,6 +57,7 @@ class Reader:
         """(rows, cols) that are decoded together"""
         self._local = threading.local()
         self._handles: list[Any] = []
+        self._known_tiles: tuple[StoredTiles | None, Decoder | None] | None = None
         self._lock = threading.Lock()
 
     def read(self, block: Block, bands: int | Sequence[int] | None = None) -> Array:
@@ -95,11 +98,28 @@ class Reader:
 
     def _pixels(self, dataset: Any, inside: Block, bands: int | Sequence[int] | None) -> Array:
         """Stored values of a block that lies inside the raster."""
+        rows, cols = self.info.tile
+        if self._aligned and inside.row % rows == inside.col % cols == 0:
+            decode = self._tiles()[1]
+            if decode is not None and (values := decode(inside, bands)) is not None:
+                return values
         pixels = self.info.pixel_by_pixel if self._aligned and not isinstance(bands, int) else None
         if pixels is None:
             return dataset.read(bands, window=inside.window)
         values = pixels.read(inside)
         return values if bands is None else values[np.array(bands) - 1]
+
+    @property
+    def stored(self) -> StoredTiles | None:
+        """The tiles as they are stored in the file, whatever the grid of the reader; None where it is no TIFF."""
+        return self._tiles()[0]
+
+    def _tiles(self) -> tuple[StoredTiles | None, Decoder | None]:
+        """The tiles, and what decodes them without GDAL, where that can be done."""
+        with self._lock:
+            if self._known_tiles is None:
+                self._known_tiles = tiles_of(self.info, self.read)
+            return self._known_tiles
 
     def _out_type(self) -> np.dtype[Any]:
         return np.dtype(np.float32) if np.isnan(self.fill) else self.info.dtype
@@ -141,6 +161,9 @@ class Reader:
             for handle in self._handles:
                 handle.close()
             self._handles.clear()
+            if self._known_tiles is not None and self._known_tiles[0] is not None:
+                self._known_tiles[0].close()
+            self._known_tiles = None
             self._local = threading.local()
 
     def __enter__(self) -> Self:

@@ -31,12 +31,12 @@ class StoredTiles:
         self.decode = decode
         self._info = info
         by_pixel = info.profile["interleave"] == "pixel"
-        self._layout = tiff.Layout(info.shape, info.tile, 1 if by_pixel else info.bands)
+        self.layout = tiff.Layout(info.shape, info.tile, 1 if by_pixel else info.bands)
         values = info.tile[0] * info.tile[1] * (info.bands if by_pixel else 1)
         self._largest = LARGEST * values * info.dtype.itemsize + 1024
         self._file = os.open(info.path, os.O_RDONLY)
         try:
-            places = tiff.directory(self._read, self._layout.planes * math.prod(self._layout.tiles))
+            places = tiff.directory(self._read, self.layout.planes * math.prod(self.layout.tiles))
             self._offsets, self._sizes = places.offsets.of(self._read), places.sizes.of(self._read)
             self.coded = places.coded(self._read)
             """as of `tiff.Directory`"""
@@ -46,17 +46,21 @@ class StoredTiles:
 
     def holds(self, block: Block) -> bool:
         """Whether all tiles of a block are stored, which those of a sparse file are not, and of a size that can be."""
-        sizes = self._sizes[self._layout.numbers(block)]
+        sizes = self._sizes[self.layout.numbers(block)]
         return bool(np.all((sizes > 0) & (sizes <= self._largest)))
 
     def tiles(self, block: Block) -> Tiles:
         """The tiles of a block; InputError where the file ends before."""
-        numbers = self._layout.numbers(block).ravel()
-        sizes = self._sizes[numbers]
-        tiles = Tiles.joined(map(self._read, self._offsets[numbers].tolist(), sizes.tolist()), sizes)
-        if len(tiles.data) != sizes.sum():
+        numbers = self.layout.numbers(block).ravel()
+        tiles = Tiles.joined(map(self.content, numbers.tolist()), self._sizes[numbers])
+        if len(tiles.data) != tiles.sizes.sum():
             raise InputError(f"{self._info.path} cannot be read: it ends within a tile of {block}")
         return tiles
+
+    def content(self, number: int) -> bytes:
+        """The bytes of one tile; fewer where the file ends before, none where it is not stored, or too large."""
+        start, size = int(self._offsets[number]), int(self._sizes[number])
+        return self._read(start, size) if 0 < size <= self._largest else b""
 
     def _read(self, start: int, size: int) -> bytes:
         return os.pread(self._file, size, start)

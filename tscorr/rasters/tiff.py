@@ -137,7 +137,10 @@ def directory(read: Read, tiles: int | None = None) -> Directory:
     """The lists of the first image of a file; ValueError where it has none, or of another number of tiles."""
     try:
         order: Literal["<", ">"] = "<" if bytes(read(0, 2)) == b"II" else ">"
-        big = _numbers(read, 2, f"{order}H")[0] == 43
+        (version,) = _numbers(read, 2, f"{order}H")
+        if version not in {42, 43}:
+            raise ValueError(f"no whole TIFF: of version {version}")
+        big = version == 43
         (place,) = _numbers(read, 8 if big else 4, f"{order}Q" if big else f"{order}I")
         count_type, entry_type, room = ("Q", "HHQ", 8) if big else ("H", "HHI", 4)
         (entries,) = _numbers(read, place, order + count_type)
