@@ -74,25 +74,23 @@ class ShadowByBrightness:
         A pixel is sunlit if, in most bands, it is nearer to the diffuse level of full light than to that of the
         sky alone, on a logarithmic scale; the specular part only makes it brighter.
         """
-        where = np.nonzero(unsure)
-        if not where[0].size:
+        where = np.flatnonzero(unsure)
+        if not where.size or np.isnan(self.diffuse).all():
             return shadowed
-        sun, normal = (
-            np.stack([np.broadcast_to(part, unsure.shape)[where] for part in vectors]) for vectors in (sun, normal)
-        )
+        sun, normal = (vectors.reshape(3, -1) for vectors in (sun, normal))
+        sun, normal = (every[:, where] if every.shape[1] > 1 else every for every in (sun, normal))
         cos_i, sun_up, up = (sun * normal).sum(axis=0), sun[2], normal[2]
-        row = rows[where]
+        row = rows.ravel()[where]
         plane = np.where(self.horizontal[row], np.maximum(cos_i, 0) / sun_up, 1.0)
         sky_view = np.where(self.horizontal[row], (1 + up) / 2, 1.0)
         direct, diffuse = self.direct[row].T, self.diffuse[row].T
         sky = diffuse * (1 - direct) * sky_view
         full = sky + diffuse * direct * plane
         scale, offset = np.array(self.stored.scale)[:, None], np.array(self.stored.offset)[:, None]
-        all_bands: Any = (slice(None), *where)
-        seen = image[all_bands] * scale + offset
+        seen = image.reshape(len(image), -1)[:, where] * scale + offset
         tells = full > LEAST_CONTRAST * sky  # False where t0 is not known
         bright = tells & (seen**2 * np.sign(seen) > full * sky)
         votes = tells.sum(axis=0)
-        settled = shadowed.copy()
-        settled[where] = np.where(votes > 0, 2 * bright.sum(axis=0) < votes, shadowed[where])
-        return settled
+        settled = shadowed.flatten()
+        settled[where] = np.where(votes > 0, 2 * bright.sum(axis=0) < votes, settled[where])
+        return settled.reshape(shadowed.shape)

@@ -85,7 +85,7 @@ class BitMask:
             (top - block.row, block.row + block.height - bottom),
             (left - block.col, block.col + block.width - right),
         )
-        return np.pad(bits == 0, beyond, mode="edge")
+        return np.pad(bits == 0, beyond, mode="edge") if np.any(beyond) else bits == 0
 
     def _rows(self, top: int, bottom: int) -> NDArray[Any]:
         """The bits of whole rows: uint8 (rows, bytes)."""
