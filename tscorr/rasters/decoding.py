@@ -19,10 +19,12 @@ NONE, ZSTD = 1, 50000
 LEAST_BYTES = 1 << 15
 """of a tile, below which GDAL is faster"""
 UNKNOWN_SIZE = -1
+LEAST_SHARE = 0.5
+"""of the tiles that a block lies in, below which GDAL, which keeps tiles for the next block, is asked for it"""
 
 
 class Decoder:
-    """Decodes blocks of whole tiles of one GeoTIFF without compression or with ZSTD; any thread may ask.
+    """Decodes blocks of one GeoTIFF without compression or with ZSTD; any thread may ask.
 
     Raises ValueError where its tiles are stored in any other way: GDAL then does it.
     """
@@ -55,15 +57,14 @@ class Decoder:
     def __call__(self, block: Block, bands: int | Sequence[int] | None = None) -> Array | None:
         """Values (bands, rows, cols) of a block, or of one band (rows, cols), from 1 on.
 
-        None where that is no block of whole tiles, where only some bands of a tile are asked for, and where the file
-        does not hold what it should: GDAL says what is wrong.
+        None where it is a small part of the tiles that it lies in, where only some bands of a tile are asked for, and
+        where the file does not hold what it should: GDAL says what is wrong.
         """
-        if bands is not None and not (isinstance(bands, int) and self._samples == 1):
+        whole = self._tiles.layout.whole_tiles(block)
+        few = block.height * block.width < LEAST_SHARE * whole.height * whole.width
+        if few or not (bands is None or (isinstance(bands, int) and self._samples == 1)):
             return None
-        try:
-            numbers = self._tiles.layout.numbers(block)
-        except ValueError:
-            return None
+        numbers = self._tiles.layout.numbers(whole)
         numbers = numbers[bands - 1 : bands] if isinstance(bands, int) else numbers
         values = np.empty((len(numbers) * self._samples, *block.shape), self._dtype)
         decompressor = ZstdDecompressor()
@@ -71,14 +72,22 @@ class Decoder:
             content = self._content(int(numbers[plane, i, j]), decompressor)
             if content is None:
                 return None
+            tile = np.frombuffer(content, self._dtype).reshape(self._shape)
             first = plane * self._samples
-            self._put(
-                np.frombuffer(content, self._dtype).reshape(self._shape),
-                values[first : first + self._samples],
-                i * self._shape[0],
-                j * self._shape[1],
-            )
+            top, left = whole.row + i * len(tile) - block.row, whole.col + j * tile.shape[1] - block.col
+            self._put_part(tile, values[first : first + self._samples], top, left)
         return values[0] if isinstance(bands, int) else values
+
+    def _put_part(self, tile: Array, values: Array, top: int, left: int) -> None:
+        """Put a tile into a block, above or left of which it may begin."""
+        if top >= 0 and left >= 0:
+            self._put(tile, values, top, left)
+            return
+        decoded = np.empty((self._samples, *tile.shape[:2]), self._dtype)
+        self._put(tile, decoded, 0, 0)
+        part = decoded[:, max(0, -top) : values.shape[1] - top, max(0, -left) : values.shape[2] - left]
+        top, left = max(0, top), max(0, left)
+        values[:, top : top + part.shape[1], left : left + part.shape[2]] = part
 
     def _content(self, number: int, decompressor: ZstdDecompressor) -> bytes | None:
         """The bytes of a tile before they were compressed, or None where they are not as many as it has."""

@@ -98,11 +98,9 @@ class Reader:
 
     def _pixels(self, dataset: Any, inside: Block, bands: int | Sequence[int] | None) -> Array:
         """Stored values of a block that lies inside the raster."""
-        rows, cols = self.info.tile
-        if self._aligned and inside.row % rows == inside.col % cols == 0:
-            decode = self._tiles()[1]
-            if decode is not None and (values := decode(inside, bands)) is not None:
-                return values
+        decode = self._tiles()[1] if self._aligned else None
+        if decode is not None and (values := decode(inside, bands)) is not None:
+            return values
         pixels = self.info.pixel_by_pixel if self._aligned and not isinstance(bands, int) else None
         if pixels is None:
             return dataset.read(bands, window=inside.window)

@@ -97,19 +97,21 @@ class Layout:
 
         Raises ValueError unless the block consists of whole tiles.
         """
-        top, left = block.row // self.tile[0], block.col // self.tile[1]
-        down, right = self.tiles
-        bottom, last = -(-(block.row + block.height) // self.tile[0]), -(-(block.col + block.width) // self.tile[1])
-        covered = (
-            top * self.tile[0],
-            left * self.tile[1],
-            min(bottom * self.tile[0], self.shape[0]),
-            min(last * self.tile[1], self.shape[1]),
-        )
-        if covered != (block.row, block.col, block.row + block.height, block.col + block.width):
+        if self.whole_tiles(block) != block:
             raise ValueError(f"{block} does not consist of whole tiles of {self.tile}")
-        planes = np.arange(self.planes)[:, None, None] * (down * right)
-        return planes + np.arange(top, bottom)[:, None] * right + np.arange(left, last)
+        rows, cols = self.tile
+        down, across = self.tiles
+        below, right = -(-(block.row + block.height) // rows), -(-(block.col + block.width) // cols)
+        planes = np.arange(self.planes)[:, None, None] * (down * across)
+        return planes + np.arange(block.row // rows, below)[:, None] * across + np.arange(block.col // cols, right)
+
+    def whole_tiles(self, block: Block) -> Block:
+        """The block of whole tiles that another one lies in, as far as the raster goes."""
+        rows, cols = self.tile
+        top, left = block.row // rows * rows, block.col // cols * cols
+        bottom = min(-(-(block.row + block.height) // rows) * rows, self.shape[0])
+        right = min(-(-(block.col + block.width) // cols) * cols, self.shape[1])
+        return Block(top, left, bottom - top, right - left)
 
     def nonzero(self, shape: tuple[int, ...], values: Array) -> Array:
         """Which tiles (planes, rows, cols), of that shape, of a block (bands, rows, cols) hold anything but 0."""
