@@ -184,6 +184,26 @@ def test_normals_without_heights_are_told_to_show_no_shadows(tmp_path, caplog):
     assert "scene 'roofs': normals without heights show no cast shadows" in caplog.text
 
 
+def test_normals_that_point_into_the_ground_are_doubted(tmp_path, caplog):
+    config = small_scene(tmp_path, {"surface": {"kind": "normals", "path": "normals.tif"}, "shadows": False})
+    for up, doubted in ((1, False), (-1, True)):
+        level = np.stack([np.zeros(SHAPE), np.zeros(SHAPE), np.full(SHAPE, up)]).astype(np.float32)
+        write_raster(tmp_path / "normals.tif", level)
+        batch.plan(load_config(config))
+        assert (f"the normals {tmp_path}/normals.tif points down" in caplog.text) == doubted
+
+
+def test_the_settings_of_a_result_do_not_write_into_it(tmp_path):
+    (scene,) = batch.run(small_scene(tmp_path)).scenes
+    before = {path: path.read_bytes() for path in scene.folder.iterdir()}
+    (line,) = problems(scene.folder / "settings.toml", ConfigError)
+    assert line.startswith(f"[output] directory = {scene.folder}/out lies in the published result {scene.folder}, ")
+    assert {path: path.read_bytes() for path in scene.folder.iterdir()} == before
+    elsewhere = tmp_path / "again.toml"
+    shutil.copy(scene.folder / "settings.toml", elsewhere)
+    assert batch.run(elsewhere, overwrite=True).exit_code == 0
+
+
 def test_what_is_done_and_what_is_replaced_needs_no_disk(tmp_path, monkeypatch):
     config = small_scene(tmp_path, {"name": "a"}, {"name": "b"})
     batch.run(config)

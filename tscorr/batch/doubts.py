@@ -27,9 +27,7 @@ def warn(planned: Sequence[Scene]) -> None:
     for scene in planned:
         _of_time(scene)
         _of_coverage(scene)
-        surface = scene.settings.surface
-        if scene.settings.shadows and isinstance(surface, config.NormalsSettings) and surface.heights is None:
-            log.warning("scene '%s': normals without heights show no cast shadows: give heights = ...", scene.name)
+        _of_normals(scene)
 
 
 def _of_missing_scales(planned: Sequence[Scene]) -> None:
@@ -82,6 +80,26 @@ def _of_values(scene: Scene) -> None:
             "scale = ...; radiances have to be made reflectances first",
             image.path,
             factor,
+        )
+
+
+def _of_normals(scene: Scene) -> None:
+    """Normals without the heights that cast shadows, and normals into the ground."""
+    surface = scene.settings.surface
+    if not isinstance(surface, config.NormalsSettings):
+        return
+    if scene.settings.shadows and surface.heights is None:
+        log.warning("scene '%s': normals without heights show no cast shadows: give heights = ...", scene.name)
+    normals = scene.surface_files[-1]
+    try:
+        up = rasters.middle_value(normals, SAMPLE_PX, normals.nodata, band=3)
+    except (TscorrError, OSError):  # its scene will tell
+        return
+    if up < 0:
+        log.warning(
+            "half of the middle of the normals %s points down, where no light comes from: the bands are east, north, "
+            "up, away from the ground",
+            normals.path,
         )
 
 

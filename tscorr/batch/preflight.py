@@ -75,6 +75,12 @@ def _writable(folder: Path) -> Path:
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
     said = f"[output] directory = {folder}: {existing}"
+    result = next((place for place in (folder, *folder.parents) if publish.read_manifest(place) is not None), None)
+    if result is not None:
+        raise ConfigError(
+            f"[output] directory = {folder} lies in the published result {result}, which would no longer be what its "
+            f"manifest says; allowed is a folder elsewhere: give one, or copy the configuration to another folder"
+        )
     if not existing.is_dir():
         raise ConfigError(f"{said} is not a folder; allowed is a folder that can be made")
     try:

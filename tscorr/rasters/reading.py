@@ -205,12 +205,12 @@ def read_samples(info: RasterInfo, most: int, side: int) -> Array:
     return values[np.isfinite(values)]
 
 
-def middle_value(info: RasterInfo, side: int, nodata: float | None) -> float:
-    """Median of band 1 over side x side pixels in the middle of a raster, without `nodata`; nan of none."""
+def middle_value(info: RasterInfo, side: int, nodata: float | None, band: int = 1) -> float:
+    """Median of a band over side x side pixels in the middle of a raster, without `nodata`; nan of none."""
     rows, cols = info.shape
     part = Block(max(0, (rows - side) // 2), max(0, (cols - side) // 2), min(side, rows), min(side, cols))
     with opened(info.path, ours=info.ours) as dataset:
-        values = dataset.read(1, window=part.window)
+        values = dataset.read(band, window=part.window)
     values = values[np.isfinite(values) & (values != nodata)]
     return float(np.median(values)) if values.size else float("nan")
 
