@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from functools import cache
+from functools import cache, cached_property
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any, Protocol
@@ -67,7 +67,7 @@ class Sun(Protocol):
         """
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SunField:
     """The sun at one instant: bilinear between the four corners.
 
@@ -82,7 +82,7 @@ class SunField:
     convergence_deg: float
     time: datetime | None = None
 
-    @property
+    @cached_property
     def center(self) -> Array:
         """Unit vector (3,) at the middle of the scene."""
         mean = self.corners.mean(axis=(1, 2))
@@ -93,7 +93,7 @@ class SunField:
         """The farthest of the corners: between them lies all else."""
         return float(angle_between(self.corners, self.center[:, None, None]).max())
 
-    @property
+    @cached_property
     def is_constant(self) -> bool:
         """Whether one vector serves the whole scene."""
         spread = np.abs(self.corners - self.center[:, None, None]).max()

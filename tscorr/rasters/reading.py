@@ -88,9 +88,11 @@ class Reader:
                 values[..., rows, cols] = self._pixels(dataset, inside, bands)
         if np.isnan(self.fill):
             values = values.astype(np.float32, copy=False)
-            values[~np.isfinite(values)] = np.nan
+            void = ~np.isfinite(values)
             if self.info.nodata is not None:
-                values[values == np.float32(self.info.nodata)] = np.nan
+                void |= values == np.float32(self.info.nodata)
+            if void.any():
+                values[void] = np.nan
             if self._meaning is not None:
                 scale, offset = self._meaning
                 values = values * scale + offset

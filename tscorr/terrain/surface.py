@@ -121,7 +121,7 @@ class DsmSurface(Surface):
         part = Block(block.row - top, block.col - left, block.height + top + bottom, block.width + left + right)
         missing = (halo - top, halo - bottom), (halo - left, halo - right)
         heights = self._read(part)
-        return heights if not np.any(missing) else np.pad(heights, missing, mode="edge")
+        return np.pad(heights, missing, mode="edge") if np.any(missing) else heights
 
     def normal_sigma_deg(self, block: Block) -> Array:
         """From the noise of the heights, (rows, cols). [deg]
@@ -228,8 +228,9 @@ class GivenNormals(Surface):
 
 
 def _filled(heights: Array, survey: Survey) -> Array:
-    void = np.isnan(heights)
-    return np.where(void, np.float32(survey.level_m), heights) if void.any() else heights
+    if heights.size == 0 or not np.isnan(heights.min()):  # which is nan where any is
+        return heights
+    return np.where(np.isnan(heights), np.float32(survey.level_m), heights)
 
 
 def _common(block: Block, other: Block) -> tuple[slice, slice]:
