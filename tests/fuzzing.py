@@ -133,8 +133,20 @@ def write_scenes(folder):
     envi = {"class_map": "class_envi.tif", "image": "image.img", "surface": flat, "scale": 1e-4}
     write_raster(folder / "class_envi.tif", classes, crs="EPSG:32631")
     view = {"kind": "mosaic", "index": "index.tif", "cameras": "cameras.csv"}
+    tiled = {
+        "image": "large.tif",
+        "class_map": "large_classes.tif",
+        "surface": {"kind": "dsm", "path": "large_dsm.tif"},
+    }
+    zstd = {"compress": "zstd", "blockxsize": 128, "blockysize": 128}
+    write_image(folder / "large.tif", values, interleave="pixel", predictor=2, **zstd)
+    large = {"compress": "none", "blockxsize": 256, "blockysize": 256, "bigtiff": "yes"}
+    write_raster(folder / "large_classes.tif", classes, **large)
+    heights = rng.normal(1, 0.02, SHAPE).astype(np.float32)
+    write_raster(folder / "large_dsm.tif", heights, predictor=3, bigtiff="yes", **zstd)
     changes = {
         "surface": {},
+        "tiled": tiled,
         "line": {"sun": None, "view": {"kind": "line", "trajectory": "trajectory.csv"}, "surface": flat},
         "mosaic": {"view": view, "surface": flat},
         "envi": envi,
@@ -147,6 +159,7 @@ def write_scenes(folder):
 
 
 TARGETS = {
+    "tiled": ("large.tif", "large_classes.tif", "large_dsm.tif"),
     "surface": ("image.tif", "class_map.tif", "dsm.tif", "tiles.toml", "surface.toml"),
     "line": ("trajectory.csv", "line.toml"),
     "mosaic": ("index.tif", "cameras.csv", "mosaic.toml"),
@@ -157,16 +170,20 @@ TARGETS = {
 def mutated_tiff(content, rng):
     """A TIFF with one to four entries or bytes of its directories changed, or cut short."""
     data = bytearray(content)
-    (start,) = struct.unpack_from("<I", data, 4)
-    (entries,) = struct.unpack_from("<H", data, start)
+    big = data[2] == 43
+    word, head, size = ("<Q", 8, 20) if big else ("<I", 2, 12)
+    count, value = (4, 12) if big else (4, 8)
+    (start,) = struct.unpack_from(word, data, 8 if big else 4)
+    (entries,) = struct.unpack_from("<Q" if big else "<H", data, start)
     for _ in range(rng.choice((1, 1, 2, 4))):
-        at = start + 2 + 12 * rng.randrange(entries)
+        at = start + head + size * rng.randrange(entries)
         kind = rng.randrange(8)
         if kind < 3:
-            value = rng.choice((0, 1, 2, 3, 7, 8, 16, 255, 1000, 65535, 65536, 2**24, 2**31 - 1, 2**31, 2**32 - 1))
-            struct.pack_into("<I", data, at + 8, value)
+            limit = 2 ** (64 if big else 32) - 1
+            number = rng.choice((0, 1, 2, 3, 7, 8, 16, 255, 1000, 65535, 65536, 2**24, 2**31 - 1, 2**31, limit))
+            struct.pack_into(word, data, at + value, number)
         elif kind == 3:
-            struct.pack_into("<I", data, at + 4, rng.choice((0, 1, 2, 3, 1000, 2**31, 2**32 - 1)))
+            struct.pack_into(word, data, at + count, rng.choice((0, 1, 2, 3, 1000, 2**31, 2**32 - 1)))
         elif kind == 4:
             struct.pack_into("<H", data, at + 2, rng.randrange(20))
         elif kind == 5:
@@ -174,7 +191,7 @@ def mutated_tiff(content, rng):
                 "<H", data, at, rng.choice((254, 256, 257, 258, 259, 277, 284, 317, 322, 339, 33550, 42113))
             )
         elif kind == 6:  # what an entry points to: places, scales, names
-            place = struct.unpack_from("<I", data, at + 8)[0]
+            place = struct.unpack_from(word, data, at + value)[0]
             if place + 8 <= len(data):
                 number = rng.choice((0.0, float("nan"), float("inf"), 1e308, 1e-308, -1.0, rng.uniform(-1e9, 1e9)))
                 struct.pack_into("<d", data, place + 8 * rng.randrange(1 + (len(data) - place - 8) // 64), number)
@@ -285,7 +302,7 @@ def check_message(message):
 def case(seed, folder, configurations):
     """Run one case; the kind of file that was changed, and what became of it."""
     rng = random.Random(seed)
-    name = rng.choices(list(TARGETS), weights=(6, 2, 2, 2))[0]
+    name = rng.choices(list(TARGETS), weights=(4, 6, 2, 2, 2))[0]
     target = folder / rng.choice(TARGETS[name])
     honest = target.read_bytes()
     target.write_bytes(mutated(target, rng))

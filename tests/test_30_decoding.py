@@ -1,7 +1,10 @@
 """rasters: tiles that are decoded here have the values that GDAL finds in them, or are left to GDAL."""
 
 import os
+import struct
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +16,7 @@ from tscorr import rasters
 from tscorr.errors import InputError
 from tscorr.grid import Block, blocks
 from tscorr.rasters import tiff
-from tscorr.rasters.decoding import tiles_of
+from tscorr.rasters.decoding import Decoder
 
 SHAPE, TILE = (300, 420), 128
 WHOLE = Block(0, 0, *SHAPE)
@@ -38,11 +41,16 @@ def written(path, values, **profile):
     return write_raster(path, values, **profile)
 
 
+@contextmanager
 def decoder_of(path):
     """What decodes it here, or None."""
-    info = rasters.describe(path)
-    tiles, decode = tiles_of(info, lambda _: None)
-    return tiles, decode
+    try:
+        decode = Decoder(rasters.describe(path), lambda _: None)
+    except ValueError:
+        yield None
+    else:
+        yield decode
+        decode.close()
 
 
 @pytest.mark.parametrize("compress", ["zstd", "none"])
@@ -55,10 +63,9 @@ def test_values_are_those_that_gdal_finds(tmp_path, compress, interleave, dtype,
     path = written(tmp_path / "x.tif", values_of(dtype), compress=compress, interleave=interleave, **predictor)
     too_small = np.dtype(dtype).itemsize == 1 and interleave == "band"
     by_bytes = floating and predicted and compress == "zstd" and (dtype == "float64" or interleave == "pixel")
-    tiles, decode = decoder_of(path)
-    assert (decode is None) == (too_small or by_bytes)
     expected = read_raster(path)
-    with tiles, rasters.Reader(rasters.describe(path)) as reader:
+    with decoder_of(path) as decode, rasters.Reader(rasters.describe(path)) as reader:
+        assert (decode is None) == (too_small or by_bytes)
         for block in (
             WHOLE,
             Block(0, 0, TILE, TILE),
@@ -72,6 +79,8 @@ def test_values_are_those_that_gdal_finds(tmp_path, compress, interleave, dtype,
             np.testing.assert_array_equal(reader.read(block, [3, 1]), there[[2, 0]])
             if decode is not None and block.height > 100:
                 np.testing.assert_array_equal(decode(block), there)
+                np.testing.assert_array_equal(decode(block, [1, 2, 3]), there)
+                assert decode(block, [3, 1]) is None
                 assert (decode(block, 2) is None) == (interleave == "pixel")
 
 
@@ -100,10 +109,8 @@ def test_many_threads_find_what_one_finds(tmp_path):
 def test_what_is_stored_otherwise_is_left_to_gdal(tmp_path, profile):
     values = values_of("uint16") % 4096
     path = written(tmp_path / "x.tif", values, **profile)
-    tiles, decode = decoder_of(path)
-    tiles.close()
-    assert decode is None
-    with rasters.Reader(rasters.describe(path)) as reader:
+    with decoder_of(path) as decode, rasters.Reader(rasters.describe(path)) as reader:
+        assert decode is None
         np.testing.assert_array_equal(reader.read(WHOLE), values)
 
 
@@ -153,8 +160,7 @@ def test_a_tile_that_is_not_what_it_should_be_is_an_error_that_names_the_file(tm
 @pytest.mark.parametrize("size", [TILE_BYTES + 1, 10**9])
 def test_no_more_is_made_of_a_tile_than_it_has(tmp_path, size):
     path = with_first_tile(tmp_path / "x.tif", frame(size))
-    tiles, decode = decoder_of(path)
-    with tiles, rasters.Reader(rasters.describe(path)) as reader:
+    with decoder_of(path) as decode, rasters.Reader(rasters.describe(path)) as reader:
         assert decode(FIRST, 1) is None
         np.testing.assert_array_equal(reader.read(FIRST, 1), read_raster(path)[0][FIRST.slices])
 
@@ -167,3 +173,55 @@ def test_a_file_that_is_cut_short_while_it_is_read_is_named(tmp_path, compress):
         os.truncate(path, path.stat().st_size - 1000)
         with pytest.raises(InputError, match=r"x\.tif cannot be read at rows 256"):
             reader.read(Block(256, 384, 44, 36), 1)
+
+
+def entries_of(content):
+    """Where the entries of the first directory of a BigTIFF stand, by tag."""
+    (start,) = struct.unpack_from("<Q", content, 8)
+    (entries,) = struct.unpack_from("<Q", content, start)
+    places = range(start + 8, start + 8 + 20 * entries, 20)
+    return {struct.unpack_from("<H", content, place)[0]: place for place in places}
+
+
+@pytest.mark.parametrize(("dtype", "predictor"), [("uint16", 2), ("float32", 3)])
+def test_a_predictor_without_a_codec_means_nothing(tmp_path, dtype, predictor):
+    path = written(tmp_path / "x.tif", values_of(dtype, bands=1), compress="none", bigtiff="yes", interleave="pixel")
+    content = bytearray(path.read_bytes())
+    places = entries_of(content)
+    table = sorted(places.values())
+    struct.pack_into("<HHQQ", content, places[284], 317, 3, 1, predictor)  # bands of one: together or apart
+    sorted_by_tag = sorted(bytes(content[place : place + 20]) for place in table)
+    sorted_by_tag.sort(key=lambda entry: struct.unpack_from("<H", entry)[0])
+    content[table[0] : table[-1] + 20] = b"".join(sorted_by_tag)
+    path.write_bytes(content)
+    with decoder_of(path) as decode, rasters.Reader(rasters.describe(path)) as reader:
+        assert decode is not None
+        np.testing.assert_array_equal(reader.read(WHOLE, 1), values_of(dtype, bands=1)[0])
+
+
+def test_lists_at_places_that_no_file_has_are_left_to_gdal(tmp_path):
+    path = written(tmp_path / "x.tif", values_of("uint16", bands=1), bigtiff="yes")
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<Q", content, entries_of(content)[324] + 12, 2**64 - 1)
+    path.write_bytes(content)
+    with (
+        rasters.Reader(rasters.describe(path)) as reader,
+        pytest.raises(InputError, match=r"x\.tif cannot be read at rows 0 to 128"),
+    ):
+        reader.read(FIRST, 1)
+
+
+def test_a_reader_that_need_not_decode_opens_no_second_file(tmp_path):
+    path = written(tmp_path / "x.tif", values_of("uint16"), compress="deflate")
+    fine = written(tmp_path / "y.tif", values_of("uint16"))
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    with rasters.Reader(rasters.describe(path)) as left, rasters.Reader(rasters.describe(fine)) as pixel:
+        left.read(WHOLE)
+        pixel.read(Block(3, 3, 1, 1))
+        assert len(list(Path("/proc/self/fd").iterdir())) == before + 2
+
+
+def test_a_directory_of_very_many_entries_is_not_looked_through():
+    content = b"MM\0+" + bytes(4) + (16).to_bytes(8, "big") + (10**6).to_bytes(8, "big") + bytes(2 * 10**7)
+    with pytest.raises(ValueError, match="no whole TIFF: 1000000 entries in its directory"):
+        tiff.directory(tiff.bytes_of(content))

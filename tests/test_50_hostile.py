@@ -330,7 +330,10 @@ def test_a_class_map_of_fractions_is_refused(tmp_path, dtype):
     assert re.search(r"class_map\.tif holds float\d\d values; allowed are integers", planned(tmp_path))
 
 
-@pytest.mark.parametrize("profile", [{}, {"bigtiff": "yes"}, {"endianness": "big"}], ids=str)
+KINDS_OF_TIFF = {}, {"bigtiff": "yes"}, {"endianness": "big"}, {"bigtiff": "yes", "endianness": "big"}
+
+
+@pytest.mark.parametrize("profile", KINDS_OF_TIFF, ids=str)
 @pytest.mark.parametrize(("number", "text"), [(NODATA, "blank"), (-3, "no")])
 def test_a_nodata_value_that_is_no_number_is_refused(tmp_path, profile, number, text):
     path = write_image(tmp_path / "image.tif", nodata=number, **profile)
@@ -338,7 +341,7 @@ def test_a_nodata_value_that_is_no_number_is_refused(tmp_path, profile, number, 
     assert re.search(rf"image\.tif has the nodata value '{text}'; allowed is a number", planned(tmp_path))
 
 
-@pytest.mark.parametrize("profile", [{}, {"bigtiff": "yes"}, {"endianness": "big"}], ids=str)
+@pytest.mark.parametrize("profile", KINDS_OF_TIFF, ids=str)
 def test_a_nodata_value_of_zero_is_a_number(tmp_path, profile):
     assert rasters.describe(write_image(tmp_path / "image.tif", nodata=0, **profile)).nodata == 0
 

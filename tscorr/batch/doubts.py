@@ -27,7 +27,8 @@ def warn(planned: Sequence[Scene]) -> None:
     for scene in planned:
         _of_time(scene)
         _of_coverage(scene)
-        _of_normals(scene)
+        _of_heights(scene)
+    _of_normals(planned)
 
 
 def _of_missing_scales(planned: Sequence[Scene]) -> None:
@@ -83,24 +84,28 @@ def _of_values(scene: Scene) -> None:
         )
 
 
-def _of_normals(scene: Scene) -> None:
-    """Normals without the heights that cast shadows, and normals into the ground."""
+def _of_heights(scene: Scene) -> None:
+    """Normals without the heights that cast shadows."""
     surface = scene.settings.surface
-    if not isinstance(surface, config.NormalsSettings):
-        return
-    if scene.settings.shadows and surface.heights is None:
+    if scene.settings.shadows and isinstance(surface, config.NormalsSettings) and surface.heights is None:
         log.warning("scene '%s': normals without heights show no cast shadows: give heights = ...", scene.name)
-    normals = scene.surface_files[-1]
-    try:
-        up = rasters.middle_value(normals, SAMPLE_PX, normals.nodata, band=3)
-    except (TscorrError, OSError):  # its scene will tell
-        return
-    if up < 0:
-        log.warning(
-            "half of the middle of the normals %s points down, where no light comes from: the bands are east, north, "
-            "up, away from the ground",
-            normals.path,
-        )
+
+
+def _of_normals(planned: Sequence[Scene]) -> None:
+    """Normals into the ground."""
+    given = [scene for scene in planned if isinstance(scene.settings.surface, config.NormalsSettings)]
+    files = {scene.surface_files[-1].path: scene.surface_files[-1] for scene in given}
+    for path, normals in files.items():
+        try:
+            up = rasters.middle_value(normals, SAMPLE_PX, normals.nodata, band=3)
+        except (TscorrError, OSError):  # its scene will tell
+            continue
+        if up < 0:
+            log.warning(
+                "half of the middle of the normals %s points down, where no light comes from: the bands are east, "
+                "north, up, away from the ground",
+                path,
+            )
 
 
 def _of_coverage(scene: Scene) -> None:

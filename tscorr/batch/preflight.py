@@ -74,8 +74,8 @@ def _writable(folder: Path) -> Path:
     existing = folder
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
-    said = f"[output] directory = {folder}: {existing}"
-    result = next((place for place in (folder, *folder.parents) if publish.read_manifest(place) is not None), None)
+    said, real = f"[output] directory = {folder}: {existing}", folder.resolve()
+    result = next((place for place in (real, *real.parents) if publish.read_manifest(place) is not None), None)
     if result is not None:
         raise ConfigError(
             f"[output] directory = {folder} lies in the published result {result}, which would no longer be what its "

@@ -24,7 +24,7 @@ def set_differences(values, top, left, tile):
 
 
 @njit(**LOOP)
-def set_sums(tile, values, top, left):
+def set_sums(values, top, left, tile):
     """`set_differences` undone: values (samples, rows, cols) from the pixel `top`, `left` on, as far as they reach."""
     rows, cols = min(tile.shape[0], values.shape[1] - top), min(tile.shape[1], values.shape[2] - left)
     for i in range(rows):
@@ -38,7 +38,7 @@ def set_sums(tile, values, top, left):
 
 
 @njit(**LOOP)
-def set_sums_of_bytes(tile, line, values, top, left):
+def set_sums_of_bytes(values, top, left, tile, line):
     """Predictor 3 of one band undone: numbers of 32 bits, as uint32 (rows, cols), from the pixel `top`, `left` on.
 
     tile : uint8 (rows, bytes): of each row the first bytes of all numbers, then the second, ...; as differences.

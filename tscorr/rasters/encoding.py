@@ -40,8 +40,8 @@ class Tiles(NamedTuple):
 class Encoder:
     """Encodes blocks of whole tiles for one file.
 
-    Tiles are cut out and predicted here, in one pass, and codecs are given bytes: GDAL, which is asked for those but
-    ZSTD, copies values four times before it encodes them.
+    Tiles are cut out and predicted here, in one pass, and codecs are given bytes: ZSTD's own library, or GDAL, which
+    given values would copy them four times before it encodes them.
 
     options : creation options of the file. layout : how it is cut. tiled : whether into tiles, not strips.
     """
@@ -68,7 +68,7 @@ class Encoder:
 
     def _by_gdal(self, tiles: Array, sizes: Array) -> Tiles:
         """Tiles (tiles, rows, cols, samples) as GDAL compresses the strips of a file of bytes, as wide as a tile."""
-        row_bytes, parts, coded = tiles[0, 0].nbytes, [], []
+        row_bytes, parts, stored_sizes = tiles[0, 0].nbytes, [], []
         same = np.flatnonzero(np.diff(sizes, prepend=-1, append=-1))  # the last strip of a file is shorter
         for first, last in pairwise(same.tolist()):
             rows = int(sizes[first]) // row_bytes
@@ -82,10 +82,10 @@ class Encoder:
                 content = memoryview(memory.getbuffer())
                 read = tiff.bytes_of(content)
                 places = tiff.directory(read)
-                coded.append(places.sizes.of(read))
-                stored = zip(places.offsets.of(read), coded[-1], strict=True)
+                stored_sizes.append(places.sizes.of(read))
+                stored = zip(places.offsets.of(read), stored_sizes[-1], strict=True)
                 parts.append(b"".join(content[start : start + size] for start, size in stored))
-        return Tiles.joined(parts, np.concatenate(coded))
+        return Tiles.joined(parts, np.concatenate(stored_sizes))
 
     def _filled(self, values: Array, tiles: Iterable[Array]) -> Iterator[memoryview]:
         """The bytes to compress of each tile of a block, which is put into the next of the given ones."""

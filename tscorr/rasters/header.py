@@ -57,6 +57,8 @@ class RasterInfo:
     """the raster, and what GDAL reads beside it: header, overviews, mask, world file"""
     ours: bool = False
     """written by this program: may be a VRT"""
+    driver: str = ""
+    """GDAL's name of the format"""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -152,6 +154,7 @@ def info_of(dataset: Any, path: Path, *, ours: bool) -> RasterInfo:
         envi=fields,
         files=(path, *(Path(file) for file in dataset.files[1:])),
         ours=ours,
+        driver=dataset.driver,
     )
 
 

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, Self
 
 import numpy as np
@@ -11,10 +12,9 @@ from rasterio.vrt import WarpedVRT
 
 from tscorr.errors import InputError
 from tscorr.grid import Block, Grid
-from tscorr.rasters.decoding import Decoder, tiles_of
+from tscorr.rasters.decoding import Decoder, is_worth_it
 from tscorr.rasters.header import RasterInfo, environment, opened, reason_of
 from tscorr.rasters.sound import GDAL_ERRORS, open_dataset
-from tscorr.rasters.stored_tiles import StoredTiles
 
 Array = NDArray[Any]
 
@@ -57,7 +57,9 @@ class Reader:
         """(rows, cols) that are decoded together"""
         self._local = threading.local()
         self._handles: list[Any] = []
-        self._known_tiles: tuple[StoredTiles | None, Decoder | None] | None = None
+        self._known_decoder: Decoder | None = None
+        self._has_decoder: bool | None = None
+        """None before it was looked for"""
         self._lock = threading.Lock()
 
     def read(self, block: Block, bands: int | Sequence[int] | None = None) -> Array:
@@ -100,26 +102,24 @@ class Reader:
 
     def _pixels(self, dataset: Any, inside: Block, bands: int | Sequence[int] | None) -> Array:
         """Stored values of a block that lies inside the raster."""
-        decode = self._tiles()[1] if self._aligned else None
-        if decode is not None and (values := decode(inside, bands)) is not None:
-            return values
+        if self._aligned and is_worth_it(self.info, inside):
+            decode = self._decoder()
+            if decode is not None and (values := decode(inside, bands)) is not None:
+                return values
         pixels = self.info.pixel_by_pixel if self._aligned and not isinstance(bands, int) else None
         if pixels is None:
             return dataset.read(bands, window=inside.window)
         values = pixels.read(inside)
         return values if bands is None else values[np.array(bands) - 1]
 
-    @property
-    def stored(self) -> StoredTiles | None:
-        """The tiles as they are stored in the file, whatever the grid of the reader; None where it is no TIFF."""
-        return self._tiles()[0]
-
-    def _tiles(self) -> tuple[StoredTiles | None, Decoder | None]:
-        """The tiles, and what decodes them without GDAL, where that can be done."""
+    def _decoder(self) -> Decoder | None:
+        """What decodes blocks without GDAL; None where GDAL is to do it."""
         with self._lock:
-            if self._known_tiles is None:
-                self._known_tiles = tiles_of(self.info, self.read)
-            return self._known_tiles
+            if self._has_decoder is None:
+                with suppress(OSError, ValueError):
+                    self._known_decoder = Decoder(self.info, self.read)
+                self._has_decoder = self._known_decoder is not None
+            return self._known_decoder
 
     def _out_type(self) -> np.dtype[Any]:
         return np.dtype(np.float32) if np.isnan(self.fill) else self.info.dtype
@@ -161,9 +161,9 @@ class Reader:
             for handle in self._handles:
                 handle.close()
             self._handles.clear()
-            if self._known_tiles is not None and self._known_tiles[0] is not None:
-                self._known_tiles[0].close()
-            self._known_tiles = None
+            if self._known_decoder is not None:
+                self._known_decoder.close()
+            self._known_decoder = self._has_decoder = None
             self._local = threading.local()
 
     def __enter__(self) -> Self:

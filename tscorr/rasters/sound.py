@@ -104,8 +104,11 @@ def _nodata_of_tiff(path: Path) -> str | None:
         table = file.read(entry.size * min(entries, MOST_TAGS))
         for tag, _, length, place in entry.iter_unpack(table[: len(table) // entry.size * entry.size]):
             if tag == GDAL_NODATA:
-                file.seek(place)
-                text = file.read(min(length, 80)) if length > width else struct.pack(whole, place)[:length]
+                if length <= width:
+                    text = struct.pack(whole, place)[:length]
+                else:
+                    file.seek(place)
+                    text = file.read(min(length, 80))
                 return text.rstrip(b"\0 ").decode("latin-1")
     return None
 

@@ -23,26 +23,39 @@ LARGEST = 1.5
 class StoredTiles:
     """The encoded tiles of an image; any thread may ask.
 
-    info : of the image. decode : its values (bands, rows, cols) in a block.
-    Raises ValueError where its tiles cannot be found, and OSError where it cannot be read.
+    info : of the image. decode : its values (bands, rows, cols) in a block. wanted : told how they are coded, as
+           `tiff.Directory.coded` says it, whether to go on; there is one list of places and sizes for all tiles.
+    Raises ValueError where its tiles cannot be found or are not wanted, and OSError where it cannot be read.
     """
 
-    def __init__(self, info: RasterInfo, decode: Callable[[Block], Array]) -> None:
+    def __init__(
+        self,
+        info: RasterInfo,
+        decode: Callable[[Block], Array],
+        wanted: Callable[[tiff.Coded], bool] = lambda _: True,
+    ) -> None:
+        if info.driver != "GTiff":
+            raise ValueError(f"{info.path} is no TIFF")
         self.decode = decode
         self._info = info
         by_pixel = info.profile["interleave"] == "pixel"
         self.layout = tiff.Layout(info.shape, info.tile, 1 if by_pixel else info.bands)
         values = info.tile[0] * info.tile[1] * (info.bands if by_pixel else 1)
         self._largest = LARGEST * values * info.dtype.itemsize + 1024
-        self._file = os.open(info.path, os.O_RDONLY)
+        self._file = info.path.open("rb", buffering=0)
         try:
             places = tiff.directory(self._read, self.layout.planes * math.prod(self.layout.tiles))
-            self._offsets, self._sizes = places.offsets.of(self._read), places.sizes.of(self._read)
             self.coded = places.coded(self._read)
             """as of `tiff.Directory`"""
+            is_wanted = wanted(self.coded)
+            if is_wanted:
+                self._offsets, self._sizes = places.offsets.of(self._read), places.sizes.of(self._read)
         except BaseException:
             self.close()
             raise
+        if not is_wanted:
+            self.close()
+            raise ValueError(f"the tiles of {info.path} are coded in another way")
 
     def holds(self, block: Block) -> bool:
         """Whether all tiles of a block are stored, which those of a sparse file are not, and of a size that can be."""
@@ -58,16 +71,20 @@ class StoredTiles:
         return tiles
 
     def content(self, number: int) -> bytes:
-        """The bytes of one tile; fewer where the file ends before, none where it is not stored, or too large."""
+        """The bytes of one tile; none where it is not there as a whole, or larger than a tile can be."""
         start, size = int(self._offsets[number]), int(self._sizes[number])
-        return self._read(start, size) if 0 < size <= self._largest else b""
+        try:
+            content = self._read(start, size) if 0 < size <= self._largest else b""
+        except OSError:  # at a place that no file has
+            return b""
+        return content if len(content) == size else b""
 
     def _read(self, start: int, size: int) -> bytes:
-        return os.pread(self._file, size, start)
+        return os.pread(self._file.fileno(), size, start)
 
     def close(self) -> None:
         """Close the file."""
-        os.close(self._file)
+        self._file.close()
 
     def __enter__(self) -> Self:
         return self

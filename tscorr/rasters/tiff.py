@@ -17,19 +17,22 @@ from tscorr.grid import Block
 Array = NDArray[Any]
 Read = Callable[[int, int], Any]
 """bytes of a file: from where, and how many; fewer where it ends before"""
+Coded = tuple[str, dict[int, set[int]]]
+"""order of the bytes as numpy writes it, and the numbers of each tag of CODING"""
 
 OFFSETS, SIZES = (273, 324), (279, 325)
 """tags of strips and of tiles"""
+BITS, CODEC, MEANING, FILL_ORDER, SAMPLES, PREDICTOR, TILE_COLS = 258, 259, 262, 266, 277, 317, 322
 CODING = {
-    258: "bits of a sample",
-    259: "codec",
-    262: "meaning of the samples",
-    266: "order of bits",
-    277: "samples of a pixel",
+    BITS: "bits of a sample",
+    CODEC: "codec",
+    MEANING: "meaning of the samples",
+    FILL_ORDER: "order of bits",
+    SAMPLES: "samples of a pixel",
     278: "rows of a strip",
     284: "bands together or apart",
-    317: "predictor",
-    322: "columns of a tile",
+    PREDICTOR: "predictor",
+    TILE_COLS: "columns of a tile",
     323: "rows of a tile",
     339: "kind of number",
 }
@@ -38,8 +41,9 @@ PALETTE = 320
 MOST_SAMPLES = 1 << 16
 MOST_NUMBERS = dict.fromkeys(CODING, MOST_SAMPLES) | {PALETTE: 3 << 16}
 """in the tags that do not have one for each tile"""
-MEANING, PLAIN = 262, {0, 1, 2, 3}
-"""that of the samples; some that change no value: grey, white to black, colours, a palette"""
+PLAIN = {0, 1, 2, 3}
+"""meanings that change no value: grey, white to black, colours, a palette"""
+MOST_ENTRIES = 4096
 WORDS = {3: "u2", 4: "u4", 16: "u8"}
 """the types that these tags may have"""
 
@@ -52,8 +56,11 @@ class Words(NamedTuple):
     length: int
 
     def of(self, read: Read) -> Array:
-        """The numbers."""
-        octets = read(self.start, self.length * self.dtype.itemsize)
+        """The numbers; ValueError where the file does not hold them."""
+        try:
+            octets = read(self.start, self.length * self.dtype.itemsize)
+        except OverflowError as error:
+            raise ValueError(f"no whole TIFF: {error}") from None
         return np.frombuffer(octets, self.dtype, self.length).astype(np.int64)
 
 
@@ -67,7 +74,7 @@ class Directory(NamedTuple):
     palette: Words | None
     """red of all values, green of all, blue of all; 65535 is full light"""
 
-    def coded(self, read: Read) -> tuple[str, dict[int, set[int]]]:
+    def coded(self, read: Read) -> Coded:
         """How bytes become values, equal for equal codings: their order, and the numbers of each tag of CODING.
 
         1 stands for a tag that is missing, as TIFF has it.
@@ -146,12 +153,14 @@ def directory(read: Read, tiles: int | None = None) -> Directory:
         (place,) = _numbers(read, 8 if big else 4, f"{order}Q" if big else f"{order}I")
         count_type, entry_type, room = ("Q", "HHQ", 8) if big else ("H", "HHI", 4)
         (entries,) = _numbers(read, place, order + count_type)
+        if entries > MOST_ENTRIES:
+            raise ValueError(f"no whole TIFF: {entries} entries in its directory")
         place += struct.calcsize(order + count_type)
         found: dict[int, Words] = {}
         for _ in range(entries):
             tag, kind, count = _numbers(read, place, order + entry_type)
             place += struct.calcsize(order + entry_type)
-            if tag in (*OFFSETS, *SIZES, *MOST_NUMBERS):
+            if tag in (*OFFSETS, *SIZES, *MOST_NUMBERS) and tag not in found:  # the first counts
                 dtype = np.dtype(WORDS[kind]).newbyteorder(order)
                 fits = count * dtype.itemsize <= room
                 start = place if fits else _numbers(read, place, order + ("Q" if big else "I"))[0]

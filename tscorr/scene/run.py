@@ -106,7 +106,7 @@ class Pipeline:
             try:
                 for name in sorted(self._products):
                     self.writers[name] = writer_of(scene, self.folder, name, self._strip)
-                self._stored = self._stored_tiles()
+                self._stored = self._stored_tiles(files)
                 run_all(self.block, units_of(scene, self._strip), workers_of(scene), progress)
             except BaseException:
                 for writer in self.writers.values():
@@ -120,13 +120,16 @@ class Pipeline:
                 write_corrected_vrt(scene, self.folder)
         return self.sums
 
-    def _stored_tiles(self) -> rasters.StoredTiles | None:
-        """The image's tiles as they are stored, where the corrected image can hold them."""
+    def _stored_tiles(self, files: ExitStack) -> rasters.StoredTiles | None:
+        """The image's tiles as they are stored, where the corrected image can hold them; `files` closes them."""
         writer = self.writers.get("corrected")
         if not (isinstance(writer, rasters.Writer) and self.scene.config.run.skip):
             return None
-        tiles = self.image.stored
-        return tiles if tiles is not None and writer.copies(tiles) else None
+        try:
+            tiles = files.enter_context(rasters.StoredTiles(self.scene.image, self.image.read))
+        except (OSError, ValueError):  # no TIFF
+            return None
+        return tiles if writer.copies(tiles) else None
 
     def _close(self, writer: rasters.Writer | rasters.EnviWriter) -> rasters.RasterInfo:
         """Close and check one raster; make it what was asked for."""

@@ -80,9 +80,9 @@ class Skipping:
         return None
 
     def idle_pixels(self, classes: Array) -> Array | None:
-        """Pixels of each row of the corrector in a block of the class map, if that is all that has to be known of it.
+        """Pixels of each row of the corrector in a block of a class map of uint8, if no more has to be known of it.
 
-        None where that is not so, or not told as quickly.
+        None where it has a material with a peak, where the image decides flags, and of other types.
         """
         if not self._on or self._wants_angles or self.flags_need_image or classes.dtype != np.uint8:
             return None

@@ -53,7 +53,7 @@ class Sums:
                 self.sigmas.arrays[name] += values
 
     def add_idle(self, tally: Tally, kind: str) -> None:
-        """Add a block of which nothing is to be removed, of whose flags no more is known than what the tally tells."""
+        """Add a block in which the tally tells all flags: without confidence, image or anything to remove."""
         counts = np.zeros_like(self.flags)
         unknown = tally.states[0].sum()
         counts[UNKNOWN_MATERIAL], counts[0] = unknown, tally.states.sum() - unknown
