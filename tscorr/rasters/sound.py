@@ -4,7 +4,7 @@ A header is cheap to forge, and GDAL believes it: a tile of 60000 x 60000 pixels
 an ENVI file that is shorter than its header says reads as zeros, and an overview may be any file of the machine.
 """
 
-import struct
+import os
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -20,6 +20,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from tscorr.errors import InputError
 from tscorr.grid import Grid
+from tscorr.rasters import tiff
 
 DRIVERS = ("GTiff", "ENVI", "HFA", "JP2OpenJPEG", "PNG", "JPEG", "AAIGrid", "EHdr")
 """formats that are opened; a VRT from an unknown hand may name any file of the machine"""
@@ -35,7 +36,7 @@ MOST_BANDS = 4096
 MOST_PAGES = 100
 """images in one TIFF: overviews and masks; each overview is half of the one before"""
 GDAL_NODATA = 42113
-MOST_TAGS = 4096
+LONGEST_NODATA = 80
 PARTS = {".ovr": "GTiff", ".msk": "GTiff", ".aux": "HFA"}
 """files beside a raster that hold pixels of it too, and their formats"""
 
@@ -92,25 +93,9 @@ def _check_nodata(dataset: Any, path: Path) -> None:
 
 
 def _nodata_of_tiff(path: Path) -> str | None:
-    """The text of the tag GDAL_NODATA in the first directory of a TIFF or BigTIFF, or None where it has none."""
-    with path.open("rb") as file:
-        head = file.read(16)
-        order, big = "<" if head.startswith(b"II") else ">", 43 in head[2:4]
-        width, whole = (8, order + "Q") if big else (4, order + "I")
-        (start,) = struct.unpack_from(whole, head, width)
-        file.seek(start)
-        (entries,) = struct.unpack(order + ("Q" if big else "H"), file.read(8 if big else 2))
-        entry = struct.Struct(order + ("HHQQ" if big else "HHII"))
-        table = file.read(entry.size * min(entries, MOST_TAGS))
-        for tag, _, length, place in entry.iter_unpack(table[: len(table) // entry.size * entry.size]):
-            if tag == GDAL_NODATA:
-                if length <= width:
-                    text = struct.pack(whole, place)[:length]
-                else:
-                    file.seek(place)
-                    text = file.read(min(length, 80))
-                return text.rstrip(b"\0 ").decode("latin-1")
-    return None
+    """The text of the tag GDAL_NODATA, or None where it has none."""
+    with path.open("rb", buffering=0) as file:
+        return tiff.text(lambda start, size: os.pread(file.fileno(), size, start), GDAL_NODATA, LONGEST_NODATA)
 
 
 def _check_size(dataset: Any, path: Path) -> None:

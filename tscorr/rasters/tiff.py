@@ -5,7 +5,7 @@ changed here.
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -145,36 +145,60 @@ def bytes_of(content: Any) -> Read:
 def directory(read: Read, tiles: int | None = None) -> Directory:
     """The lists of the first image of a file; ValueError where it has none, or of another number of tiles."""
     try:
-        order: Literal["<", ">"] = "<" if bytes(read(0, 2)) == b"II" else ">"
-        (version,) = _numbers(read, 2, f"{order}H")
-        if version not in {42, 43}:
-            raise ValueError(f"no whole TIFF: of version {version}")
-        big = version == 43
-        (place,) = _numbers(read, 8 if big else 4, f"{order}Q" if big else f"{order}I")
-        count_type, entry_type, room = ("Q", "HHQ", 8) if big else ("H", "HHI", 4)
-        (entries,) = _numbers(read, place, order + count_type)
-        if entries > MOST_ENTRIES:
-            raise ValueError(f"no whole TIFF: {entries} entries in its directory")
-        place += struct.calcsize(order + count_type)
         found: dict[int, Words] = {}
-        for _ in range(entries):
-            tag, kind, count = _numbers(read, place, order + entry_type)
-            place += struct.calcsize(order + entry_type)
+        order, room, entries = _entries(read)
+        for tag, kind, count, place in entries:
             if tag in (*OFFSETS, *SIZES, *MOST_NUMBERS) and tag not in found:  # the first counts
                 dtype = np.dtype(WORDS[kind]).newbyteorder(order)
-                fits = count * dtype.itemsize <= room
-                start = place if fits else _numbers(read, place, order + ("Q" if big else "I"))[0]
                 sane = count <= MOST_NUMBERS[tag] if tag in MOST_NUMBERS else tiles in {None, count}
                 if not sane:
                     raise ValueError(f"no whole TIFF: {count} numbers in tag {tag}")
-                found[tag] = Words(start, dtype, count)
-            place += room
+                found[tag] = Words(_start(read, order, room, place, count * dtype.itemsize), dtype, count)
         strips_or_tiles = 0 if OFFSETS[0] in found else 1
         offsets, sizes = found.pop(OFFSETS[strips_or_tiles]), found.pop(SIZES[strips_or_tiles])
         palette = found.pop(PALETTE, None)
         return Directory(offsets, sizes, found, palette)
     except (KeyError, OverflowError, struct.error) as error:
         raise ValueError(f"no whole TIFF: {error}") from None
+
+
+def text(read: Read, tag: int, most: int) -> str | None:
+    """The text of a tag of the first image, no longer than that; None where it has none."""
+    try:
+        order, room, entries = _entries(read)
+        for found, _, length, place in entries:
+            if found == tag:
+                octets = bytes(read(_start(read, order, room, place, length), min(length, most)))
+                return octets.rstrip(b"\0 ").decode("latin-1")
+    except (OverflowError, ValueError, struct.error):
+        pass
+    return None
+
+
+def _entries(read: Read) -> tuple[Literal["<", ">"], int, Iterator[tuple[int, int, int, int]]]:
+    """The directory of the first image: order of bytes, room for a value in an entry, and its entries.
+
+    Of each the tag, the type, how many values, and where these stand if there is room, else where it says where.
+    """
+    order: Literal["<", ">"] = "<" if bytes(read(0, 2)) == b"II" else ">"
+    (version,) = _numbers(read, 2, f"{order}H")
+    if version not in {42, 43}:
+        raise ValueError(f"no whole TIFF: of version {version}")
+    big = version == 43
+    (place,) = _numbers(read, 8 if big else 4, f"{order}Q" if big else f"{order}I")
+    count_type, entry_type, room = ("Q", "HHQ", 8) if big else ("H", "HHI", 4)
+    (entries,) = _numbers(read, place, order + count_type)
+    if entries > MOST_ENTRIES:
+        raise ValueError(f"no whole TIFF: {entries} entries in its directory")
+    head = struct.calcsize(order + entry_type)
+    first = place + struct.calcsize(order + count_type)
+    places = (first + number * (head + room) for number in range(entries))
+    return order, room, ((*_numbers(read, at, order + entry_type), at + head) for at in places)
+
+
+def _start(read: Read, order: str, room: int, place: int, size: int) -> int:
+    """Where so many bytes of an entry's values stand."""
+    return place if size <= room else int(_numbers(read, place, order + ("Q" if room == 8 else "I"))[0])
 
 
 def _numbers(read: Read, start: int, types: str) -> tuple[Any, ...]:
