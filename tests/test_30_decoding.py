@@ -45,7 +45,7 @@ def written(path, values, **profile):
 def decoder_of(path):
     """What decodes it here, or None."""
     try:
-        decode = Decoder(rasters.describe(path), lambda _: None)
+        decode = Decoder(rasters.describe(path))
     except ValueError:
         yield None
     else:

@@ -26,19 +26,19 @@ UNKNOWN_SIZE = -1
 class Decoder:
     """Decodes blocks of one GeoTIFF of tiles without compression or with ZSTD; any thread may ask.
 
-    decode : as in `StoredTiles`. Raises ValueError where its tiles are stored in any other way, which is GDAL's
-    matter then, and OSError where it cannot be read. Close it to close its file.
+    Raises ValueError where its tiles are stored in any other way, which is GDAL's matter then, and OSError where it
+    cannot be read. Close it to close its file.
     """
 
-    def __init__(self, info: RasterInfo, decode: Callable[[Block], Array]) -> None:
+    def __init__(self, info: RasterInfo) -> None:
         self._bands, self._dtype = info.bands, info.dtype
         self._samples = info.bands if info.profile["interleave"] == "pixel" else 1
         self._shape = *info.tile, self._samples
         self._bytes = int(np.prod(self._shape)) * info.dtype.itemsize
         if self._bytes < LEAST_BYTES:
             raise ValueError(f"the tiles of {info.path} are too small")
-        self.tiles = StoredTiles(info, decode, self._is_known)
-        (codec,), (predictor,) = self.tiles.coded[1][tiff.CODEC], self.tiles.coded[1][tiff.PREDICTOR]
+        self._tiles = StoredTiles(info, wanted=self._is_known)
+        (codec,), (predictor,) = (self._tiles.coded[1][tag] for tag in (tiff.CODEC, tiff.PREDICTOR))
         self._is_compressed = codec == ZSTD
         self._fill = DECODED[predictor if self._is_compressed else 1]  # a predictor is a codec's
 
@@ -65,8 +65,8 @@ class Decoder:
         all_bands = bands is None or (not isinstance(bands, int) and [*bands] == [*range(1, self._bands + 1)])
         if not all_bands and not (isinstance(bands, int) and self._samples == 1):
             return None
-        whole = self.tiles.layout.whole_tiles(block)
-        numbers = self.tiles.layout.numbers(whole)
+        whole = self._tiles.layout.whole_tiles(block)
+        numbers = self._tiles.layout.numbers(whole)
         numbers = numbers[bands - 1 : bands] if isinstance(bands, int) else numbers
         values = np.empty((len(numbers) * self._samples, *block.shape), self._dtype)
         decompressor = ZstdDecompressor()
@@ -94,7 +94,7 @@ class Decoder:
     def _content(self, number: int, decompressor: ZstdDecompressor) -> bytes | None:
         """The bytes of a tile before they were compressed, or None where they are not as many as it has."""
         try:
-            content = self.tiles.content(number)
+            content = self._tiles.content(number)
             if self._is_compressed:
                 if frame_content_size(content) not in {UNKNOWN_SIZE, self._bytes}:
                     return None
@@ -105,7 +105,7 @@ class Decoder:
 
     def close(self) -> None:
         """Close the file."""
-        self.tiles.close()
+        self._tiles.close()
 
 
 def is_worth_it(info: RasterInfo, block: Block) -> bool:

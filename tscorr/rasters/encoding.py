@@ -14,6 +14,9 @@ from tscorr.rasters import tiff
 
 Array = NDArray[Any]
 
+Cut = tuple[Array, tuple[int, int], int]
+"""of a tile the values (samples, rows, cols) that it is cut from, row and column of its first pixel there, and how
+many bytes of it are stored"""
 ANYWHERE = Affine.scale(2)
 """a file without a place is worth a warning to rasterio"""
 
@@ -55,13 +58,14 @@ class Encoder:
 
     def __call__(self, values: Array) -> Tiles:
         """The tiles of a block (bands, rows, cols)."""
+        cut = list(self._cut(values))
         if self._codec == "zstd":
             compressor = ZstdCompressor(level=self._levels["zstd_level"])
             again = repeat(self._empty(values, 1)[0])  # each is compressed while the processor has it at hand
-            parts = [compressor.compress(tile) for tile in self._filled(values, again)]
+            parts = [compressor.compress(tile) for tile in self._filled(cut, again)]
             return Tiles.joined(parts, np.array([len(part) for part in parts]))
-        tiles = self._empty(values, len(list(self._cut(values))))
-        sizes = np.array([len(tile) for tile in self._filled(values, tiles)])
+        tiles = self._empty(values, len(cut))
+        sizes = np.array([len(tile) for tile in self._filled(cut, tiles)])
         if self._codec == "none":
             return Tiles(tiff.octets(tiles), np.arange(len(tiles)) * tiles[0].nbytes, sizes)
         return self._by_gdal(tiles, sizes)
@@ -87,9 +91,9 @@ class Encoder:
                 parts.append(b"".join(content[start : start + size] for start, size in stored))
         return Tiles.joined(parts, np.concatenate(stored_sizes))
 
-    def _filled(self, values: Array, tiles: Iterable[Array]) -> Iterator[memoryview]:
+    def _filled(self, cut: Iterable[Cut], tiles: Iterable[Array]) -> Iterator[memoryview]:
         """The bytes to compress of each tile of a block, which is put into the next of the given ones."""
-        for (plane, (top, left), stored), tile in zip(self._cut(values), tiles, strict=False):
+        for (plane, (top, left), stored), tile in zip(cut, tiles, strict=False):
             if plane.shape[1] - top < tile.shape[0] or plane.shape[2] - left < tile.shape[1]:
                 tile[:] = 0
             self._put(plane, top, left, tile)
@@ -101,12 +105,8 @@ class Encoder:
         rows = rows if self._tiled else min(rows, values.shape[1])
         return np.empty((count, rows, cols, len(values) if self._layout.planes == 1 else 1), values.dtype)
 
-    def _cut(self, values: Array) -> Iterator[tuple[Array, tuple[int, int], int]]:
-        """The tiles of a block in the order of the file.
-
-        Of each the values (samples, rows, cols) that it is cut from, row and column of its first pixel there, and how
-        many bytes of it are stored: of strips the last of a file has only the rows that there are.
-        """
+    def _cut(self, values: Array) -> Iterator[Cut]:
+        """The tiles of a block in the order of the file; the last strip of one has only the rows that there are."""
         tile_rows, tile_cols = self._layout.tile
         for plane in (values,) if self._layout.planes == 1 else values[:, np.newaxis]:
             for top in range(0, values.shape[1], tile_rows):

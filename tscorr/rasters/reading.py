@@ -58,8 +58,7 @@ class Reader:
         self._local = threading.local()
         self._handles: list[Any] = []
         self._known_decoder: Decoder | None = None
-        self._has_decoder: bool | None = None
-        """None before it was looked for"""
+        self._looked_for_decoder = False
         self._lock = threading.Lock()
 
     def read(self, block: Block, bands: int | Sequence[int] | None = None) -> Array:
@@ -115,10 +114,10 @@ class Reader:
     def _decoder(self) -> Decoder | None:
         """What decodes blocks without GDAL; None where GDAL is to do it."""
         with self._lock:
-            if self._has_decoder is None:
+            if not self._looked_for_decoder:
+                self._looked_for_decoder = True
                 with suppress(OSError, ValueError):
-                    self._known_decoder = Decoder(self.info, self.read)
-                self._has_decoder = self._known_decoder is not None
+                    self._known_decoder = Decoder(self.info)
             return self._known_decoder
 
     def _out_type(self) -> np.dtype[Any]:
@@ -163,7 +162,7 @@ class Reader:
             self._handles.clear()
             if self._known_decoder is not None:
                 self._known_decoder.close()
-            self._known_decoder = self._has_decoder = None
+            self._known_decoder, self._looked_for_decoder = None, False
             self._local = threading.local()
 
     def __enter__(self) -> Self:

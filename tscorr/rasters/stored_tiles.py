@@ -23,15 +23,15 @@ LARGEST = 1.5
 class StoredTiles:
     """The encoded tiles of an image; any thread may ask.
 
-    info : of the image. decode : its values (bands, rows, cols) in a block. wanted : told how they are coded, as
-           `tiff.Directory.coded` says it, whether to go on; there is one list of places and sizes for all tiles.
+    info : of the image. decode : its values (bands, rows, cols) in a block, for who copies tiles. wanted : told how
+           they are coded, whether to go on; the places and sizes of all tiles are read then.
     Raises ValueError where its tiles cannot be found or are not wanted, and OSError where it cannot be read.
     """
 
     def __init__(
         self,
         info: RasterInfo,
-        decode: Callable[[Block], Array],
+        decode: Callable[[Block], Array] | None = None,
         wanted: Callable[[tiff.Coded], bool] = lambda _: True,
     ) -> None:
         if info.driver != "GTiff":

@@ -114,6 +114,7 @@ class Writer:
         """Write the tiles of a block of an image, `source`, as those of a block of this file."""
         self._put(self._layout.numbers(block).ravel(), stored.tiles(source))
         if self._sample is None:
+            assert stored.decode is not None
             sample = self._first_tile(block), checksum(stored.decode(self._first_tile(source)).data)
             with self._lock:
                 self._sample = self._sample or sample
